@@ -1,1 +1,1 @@
-"""The mirror ball in the picture: its outline, place, radius, reflectance, and what hides it."""
+"""Mirror ball in the picture: its outline, position, radius, reflectance, and occlusion."""

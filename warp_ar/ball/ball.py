@@ -1,28 +1,29 @@
-"""Place of a mirror ball, to a fraction of a millimetre, from what it mirrors of the receiver around it.
+"""Position of a mirror ball, accurate to a fraction of a millimetre, from its mirror image of the receiver.
 
-A ball's outline is a poor edge to measure by: at the rim a mirror reflects what lies right behind it, nearly at full
-strength, so that the outline is a step of some percent, and the reflections that crowd inside it are far stronger. The
-same reflections say more. A ray from the camera to the ball goes on to the receiver, whose picture the same frame
-holds; so for a ball at c every pixel x of it that mirrors a visible point of a proxy has a prediction,
+A ball's outline is poorly suited for measurement. At the rim, a mirror reflects the surface right behind it at nearly
+full strength, so the outline is a step of a few percent, next to much stronger reflections inside it. The reflections
+themselves contain more information. A ray from the camera is mirrored by the ball toward the receiver, which the same
+frame also shows directly. For a ball at c, every pixel x of the ball that mirrors a visible point of a proxy therefore
+has a predicted radiance,
 
     I(x) = reflectance * I(project(hit(x, c))),
 
-linear, for surfaces that scatter light alike to all sides. The printed card beside the ball is full of edges, and they
-move by some pixels per millimetre in every direction, height included. The centre is what makes the residuals e, taken
-between square roots of radiance, least under a cost that redescends (Geman-McClure, rho = e^2 / (e^2 + s^2)): clutter
-that the scene leaves out, shine and shadows are outvoted. Gauss-Newton with numerical derivatives, s and the steps
-shrinking. The camera sees the receiver far larger than the ball does, so it is blurred before it is compared.
+for diffuse surfaces. The printed card next to the ball is full of edges, which move by several pixels per millimetre of
+the centre in every direction, including height. The centre minimises the residuals e between square roots of radiance,
+under the robust cost rho = e^2 / (e^2 + s^2) (Geman-McClure), which rejects clutter outside the model, specular
+reflections and shadows. It is found by Gauss-Newton with numerical derivatives and with decreasing s and step sizes.
+The camera sees the receiver much larger than its mirror image, so the direct picture is blurred before the comparison.
 
-Along the line of sight the centre is determined least: there, edges move slowly. But a ball stands on something, and
-its height is better known than its place; so the height as given has a say, ``HEIGHT_COST``.
+The centre is least certain along the line of sight, where edges move slowly. The height of a ball on a surface is
+better known than its position, so deviations from the given height are penalised by ``HEIGHT_COST``.
 
-Confidence comes from the curvature at the end: (sigma^2 + ``UNMODELLED``^2) (J^T W J)^-1, times ``CORRELATED`` because
-neighbouring samples share pixels and errors of the model.
+The covariance follows from the curvature at the minimum: (sigma^2 + ``UNMODELLED``^2) (J^T W J)^-1, times
+``CORRELATED``, because neighbouring samples share pixels and model errors.
 
-The radius is told in the same way where outlines are in doubt. On the white card a ball's rim is a faint edge, for what
-a mirror reflects there is what lies behind it; from above, the edge of the card's mirror image inside the rim is
-stronger, in every frame alike, and so are the rings printed around the cross. Outlines then agree on a ball that is not
-there. Of the right radius it explains twice as much as of one a tenth smaller, wherever that ball is put.
+The radius is estimated in the same way where outlines are unreliable. On the white card, a ball's rim is a faint edge,
+because it mirrors the card behind it. Seen from above, the mirrored edge of the card inside the rim is stronger in
+every frame, and so are the rings printed around the cross; outlines may then agree on a wrong ball. A ball with the
+right radius explains twice as much of the mirror image as one that is a tenth smaller, at any position.
 """
 
 from __future__ import annotations
@@ -49,59 +50,62 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 BLURS = ((2.0, 8.0), (0.0, 3.0))
-"""Pixels: standard deviations by which ball and receiver are blurred, for the search and for the fit. The ball shows
-the receiver about a tenth as large. Without the search's own, 5 of 16 places told by two frames move by up to 1 mm."""
+"""Standard deviations in pixels of the blur of ball and receiver, for the search and for the fit. The mirror image of
+the receiver is about a tenth of its direct size. Without the blur for the search, 5 of 16 positions by two frames move
+by up to 1 mm."""
 SEARCH_STEP = 2e-3
-"""Metres between places that are tried first; edges blurred by 8 pixels lead from there."""
+"""Distance in metres between candidate positions; from there, edges blurred by 8 pixels lead to the minimum."""
 SEARCH_HEIGHT = 4e-3
-"""Metres up and down that are tried: a ball stands on something, so its height is better known."""
+"""Range of candidate heights, up and down, in metres; it is small because a ball stands on a surface."""
 SEARCH_ACROSS = 24
-"""Samples across the ball while searching."""
+"""Samples across the ball during the search."""
 STARTS = 4
-"""Places that the fit starts from."""
+"""Number of candidate positions from which the fit starts."""
 SCALES = (0.1, 0.05)
-"""Residuals, in square roots of camera values, at which a sample has half its say; stage by stage."""
+"""Residual s of each stage, in square roots of camera values, at which a sample has half its weight."""
 STEPS = 8
-"""Most Gauss-Newton steps of one stage."""
+"""Largest number of Gauss-Newton steps in one stage."""
 DONE = 2e-5
-"""Metres: a shorter step ends a stage."""
+"""Step length in metres below which a stage ends."""
 SAME = 1e-4
-"""Metres: starts that lead closer together lead to one place."""
+"""Distance in metres below which two solutions are the same."""
 LONGEST = 4e-3
-"""Metres: no step is longer, for the edges are thinner."""
+"""Largest step length in metres, because edges are thin."""
 DIFFERENCE = 2e-4
-"""Metres by which the centre is moved for derivatives."""
+"""Displacement of the centre in metres for numerical derivatives."""
 ACROSS = 60
-"""Samples across the ball at most."""
+"""Largest number of samples across the ball."""
 RIM = 0.97
-"""Share of the ball's radius within which samples lie: beyond, what is behind it shines in."""
+"""Share of the ball's radius within which samples lie; beyond it, the blur mixes in the background."""
 FEWEST = 200
-"""Samples without which nothing is said."""
+"""Smallest number of samples for a result."""
 HEIGHT_COST = 8e3
-"""Cost per square metre of leaving the height as given: 0.008 for 1 mm."""
+"""Cost per square metre of deviation from the given height: 0.008 for 1 mm."""
 CORRELATED = 50.0
-"""Number of neighbouring samples count as one."""
+"""Number of neighbouring samples that count as one independent sample."""
 MOST_DEVIATION = 6e-4
-"""Metres: a worse fit is no improvement on a ruler."""
+"""Largest standard deviation of an accepted fit, metres; a ruler is as good."""
 MOST_ERROR = 0.36
-"""Mean cost up to which the frames are explained: 0.1 to 0.2 on path-traced desks, 0.3 where a small ball is seen
-through a video codec, 0.3 to 0.6 in wrong places."""
+"""Largest mean cost at which the frames count as explained: 0.1 to 0.2 on path-traced scenes, 0.3 for a small ball in
+compressed video, 0.3 to 0.6 at wrong positions."""
 RIVAL_DISTANCE = 4e-3
 RIVAL_SHARE = 0.75
-"""Four millimetres away, metres, the cost must be so much higher: a wrong place is not that much better than others."""
+"""Largest ratio of the cost at the minimum to the cost four millimetres away; at a wrong position the ratio is
+larger."""
 DESK = Proxy("plane", size=(2.0, 2.0))
-"""Desk that is taken to lie around the marker where a scene models nothing."""
+"""Plane around the marker that is assumed for a scene without proxies."""
 REFINE_VIEWS = 3
 REFINE_SEARCH = 0.006
-"""Metres: a ruler is no worse, and less takes less time."""
+"""Search radius in metres: as accurate as a ruler, and a smaller radius takes less time."""
 UNMODELLED = 0.02
-"""Square root of radiance: what even a perfect match may be off by, such as shine; an even receiver tells nothing."""
+"""Square root of radiance by which even a correct prediction may be wrong, for example by specular reflection; on a
+uniform receiver it keeps the covariance large."""
 SPAN = 0.14
-"""Share of the given radius by which it may be off."""
+"""Relative error of the given radius that is searched."""
 RADIUS_STEP = 0.02
 """Step between tried radii, relative to the given radius."""
 ASIDE = 3
-"""Distance from the best radius, in steps, of the radii whose costs are compared with the best."""
+"""Distance from the best radius, in steps, of the radii whose costs are compared with the best cost."""
 DISTINCT = 0.9
 """Largest ratio of the least cost to the costs ``ASIDE`` at which the radius counts as determined: 0.6 to 0.87 on
 rendered desks."""
@@ -109,44 +113,44 @@ EXPLAINED = 0.42
 """Largest mean cost at which a ball explains its mirror image: 0.2 to 0.39 on rendered desks, 0.5 and more
 otherwise."""
 HOPELESS = 0.6
-"""Mean cost of a few radii beyond which no other explains the frames: 0.25 to 0.45 on rendered desks up to six steps
-beside the right one, 0.7 and more without a ball."""
+"""Mean cost of the first few radii above which the search stops: 0.25 to 0.45 on rendered scenes up to six steps from
+the right radius, 0.7 and more without a ball."""
 RADIUS_VIEWS = 3
-"""Frames that are compared: each costs a second."""
+"""Number of frames that are compared; each takes a second."""
 DEVIATION = 0.01
-"""Share of the radius: standard deviation of what is found; on rendered desks it is off by 0.003, at most by 0.012."""
+"""Standard deviation of the estimated radius, relative to it; on rendered scenes the error is 0.003, at most 0.012."""
 BETTER = 0.9
-"""Share of another ball's cost below which a given one explains the frames better."""
+"""Largest ratio of costs at which one ball explains the frames better than another."""
 _BOUND = 1e-4
-"""Metres, and share of the distance: tolerance of what hides a point from the camera."""
+"""Tolerance of the occlusion test, in metres and as a share of the distance."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BallFit:
-    """Place where a ball was found."""
+    """Result of fitting a ball's position."""
 
     center: Array
-    """World, metres, (3,)."""
+    """Centre in the world, metres, (3,)."""
     deviation: float
-    """Standard deviation along the worst axis, metres."""
+    """Standard deviation along the least certain axis, metres."""
     error: float
-    """Mean cost there, 0 (all samples agree) to 1 (none does)."""
+    """Mean cost at the centre, 0 (all samples agree) to 1 (none does)."""
     error_before: float
-    """The same where the search began."""
+    """Mean cost at the initial centre."""
     samples: int
-    """Pixels that had a say."""
+    """Number of pixels that were used."""
     rival: float
-    """Least cost ``RIVAL_DISTANCE`` away."""
+    """Smallest cost at the distance ``RIVAL_DISTANCE``."""
 
     @property
     def is_good(self) -> bool:
-        """Return whether it is determined, and explains the frames."""
+        """Return True if the position is certain and explains the frames."""
         distinct = self.error < RIVAL_SHARE * self.rival and self.error <= self.error_before + 0.01
         return self.deviation < MOST_DEVIATION and self.error < MOST_ERROR and distinct
 
 
 class BallView:
-    """One frame, prepared for comparing what balls in it mirror with what it shows."""
+    """One frame, prepared for comparing a ball's mirror image with the direct picture."""
 
     def __init__(self, image: Image, pose: Pose, camera: Camera, table: NDArray[np.float32]) -> None:
         self.pose, self.camera = pose, camera
@@ -158,19 +162,19 @@ class BallView:
 
     @functools.cached_property
     def coarse(self) -> list[Any]:
-        """Pictures of ball and receiver for the search: square roots of radiance and of the share at clipping."""
+        """Return pictures of ball and receiver for the search: square roots of radiance and of the clipped share."""
         return self._blurred(*BLURS[0])
 
     @functools.cached_property
     def fine(self) -> list[Any]:
-        """The same for the fit."""
+        """Return pictures of ball and receiver for the fit, with the same channels as ``coarse``."""
         return self._blurred(*BLURS[1])
 
     def _blurred(self, *blurs: float) -> list[Any]:
         return [np.sqrt(cv2.GaussianBlur(self._linear, (0, 0), blur) if blur else self._linear) for blur in blurs]
 
     def sample(self, picture: Any, pixels: Array) -> Array:
-        """Square roots of radiance and of the share at clipping, (n, 4)."""
+        """Return square roots of radiance and of the clipped share at pixels, (n, 4)."""
         if not len(pixels):
             return np.zeros((0, 4))
         x, y = pixels.astype(np.float32).T
@@ -179,18 +183,18 @@ class BallView:
         )
 
     def rays(self, pixels: Array) -> Array:
-        """Unit directions in the world, (n, 3)."""
+        """Return unit directions of pixels' rays in the world, (n, 3)."""
         d = np.column_stack([undistorted(self.camera, pixels), np.ones(len(pixels))])
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         return np.asarray(d @ self._world_from_camera.T, np.float64)
 
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Pixels (n, 2) of world points, and which of them lie inside the frame."""
+        """Return pixels (n, 2) of world points, and a mask of those inside the frame."""
         pixels = project(self.camera, self.pose.apply(points))
         return pixels, _within(pixels, 2.0, (self.camera.width - 3, self.camera.height - 3))
 
     def disc(self, center: Array, radius: float, across: int) -> Array:
-        """Pixels of samples on a ball, (n, 2)."""
+        """Return the pixels of samples on a ball, (n, 2)."""
         c = self.pose.apply(center)
         if c[2] < 2 * radius:
             return np.zeros((0, 2))
@@ -204,27 +208,30 @@ class BallView:
         return np.asarray(pixels[_within(pixels, 1.0, edge)], np.float64)
 
 
-# Sums and maxima over two or three columns are written out: NumPy is several times slower along a short last axis.
+# Sums and maxima over two or three columns are unrolled: NumPy is several times slower along a short last axis.
 
 
 def _within(pixels: Array, low: float, high: tuple[float, float]) -> NDArray[np.bool_]:
-    """Return which pixels (n, 2) lie inside a rectangle."""
+    """Return a mask of pixels (n, 2) inside a rectangle."""
     x, y = pixels[:, 0], pixels[:, 1]
     return np.asarray((x > low) & (x < high[0]) & (y > low) & (y < high[1]))
 
 
 class _Receiver:
-    """Planes and boxes that rays can meet, and the other balls, which hide them."""
+    """Planes and boxes that rays can hit, and the other balls, which occlude them."""
 
     def __init__(self, proxies: Sequence[Proxy], others: Sequence[Probe]) -> None:
         known = [proxy for proxy in proxies if proxy.shape in ("plane", "box")]
         self._shapes = shapes_of(known or [DESK])
         self._others = [(np.array(probe.center), probe.radius) for probe in others]
         self.hides = len(self._shapes) > 1 or bool(self._others) or any(half[2] > 0.0 for _, _, half in self._shapes)
-        """True if something can lie before what a ray meets; one plane alone hides nothing."""
+        """True if a hit can be occluded; a single plane occludes nothing."""
 
     def trace(self, origin: Array, direction: Array) -> Array:
-        """Distance to the nearest plane or box, (n,), infinite where there is none or another ball is before it."""
+        """Return the distance to the nearest plane or box, (n,).
+
+        Infinite if there is none or another ball is in front.
+        """
         nearest, _ = nearest_shape(self._shapes, origin, direction)
         for center, radius in self._others:
             nearest[_meet_ball(center, radius, origin, direction) < nearest] = np.inf
@@ -232,7 +239,7 @@ class _Receiver:
 
 
 def _meet_ball(center: Array, radius: float, origin: Array, direction: Array) -> Array:
-    """Distance along unit directions to a ball, infinite where it is missed."""
+    """Return the distance along unit directions to a ball; infinite for rays that miss it."""
     o = origin - center
     b = dot(o, direction)
     disc = b**2 - dot(o, o) + radius**2
@@ -241,12 +248,12 @@ def _meet_ball(center: Array, radius: float, origin: Array, direction: Array) ->
 
 
 _Samples = tuple[Array, Array]
-"""Unit directions in the world, (n, 3), and square roots of radiance and of the share at clipping there, (n, 4)."""
+"""Unit directions in the world, (n, 3), and square roots of radiance and of the clipped share there, (n, 4)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """Views and ball that are compared."""
+    """Views and ball of one fit, with its cost function."""
 
     views: Sequence[BallView]
     probe: Probe
@@ -254,16 +261,19 @@ class _Task:
     is_coarse: bool = False
 
     def samples(self, view: BallView, center: Array) -> _Samples:
-        """Return what one view shows of a ball."""
+        """Return the samples of a ball in one view."""
         pixels = view.disc(center, self.probe.radius, SEARCH_ACROSS if self.is_coarse else ACROSS)
         picture, _ = view.coarse if self.is_coarse else view.fine
         return view.rays(pixels), view.sample(picture, pixels)
 
     def residuals(self, view: BallView, center: Array, seen: _Samples) -> tuple[Array, NDArray[np.bool_]]:
-        """Seen less predicted, (n, 3), and which samples have a prediction; the others' residuals are 0."""
+        """Return residuals, observed minus predicted, (n, 3), and a mask of samples with a prediction.
+
+        Other residuals are 0.
+        """
         radius, eye, (directions, values) = self.probe.radius, view.eye, seen
         t = _meet_ball(center, radius, np.broadcast_to(eye, directions.shape), directions)
-        # What is known to have no prediction is not looked at further: about half of the samples.
+        # Samples without prediction are skipped: about half of them.
         index = np.flatnonzero(np.isfinite(t) & (values[:, 3] < 0.1))
         direction = directions[index]
         point = eye + t[index, None] * direction
@@ -278,7 +288,7 @@ class _Task:
         distance = np.sqrt(dot(away, away))
         away /= np.maximum(distance, 1e-9)[:, None]
         origin = np.broadcast_to(eye, away.shape)
-        # The ball with a margin: it bleeds into what is blurred.
+        # The ball with a margin, because its pixels blur into the surroundings.
         shown = _meet_ball(center, 1.1 * radius, origin, away) > distance
         if self.receiver.hides:
             shown &= self.receiver.trace(origin, away) > distance * (1.0 - _BOUND) - _BOUND
@@ -292,7 +302,7 @@ class _Task:
         return residuals, told
 
     def cost(self, center: Array, scale: float) -> tuple[float, int]:
-        """Mean of rho over all samples, and how many there are."""
+        """Return the mean of rho over all samples, and the number of samples."""
         total, count = 0.0, 0
         for view in self.views:
             e, told = self.residuals(view, center, self.samples(view, center))
@@ -303,13 +313,13 @@ class _Task:
         return (total / count if count else 1.0) + HEIGHT_COST * height**2, count
 
     def normal_equations(self, center: Array, scale: float) -> tuple[Array, Array, float]:
-        """J^T W J (3, 3), J^T W e (3,), and the weighted variance of a residual."""
+        """Return J^T W J (3, 3), J^T W e (3,), and the weighted variance of a residual."""
         matrix, vector = np.zeros((3, 3)), np.zeros(3)
         squares, weights, count = 0.0, 0.0, 0
         for view in self.views:
             seen = self.samples(view, center)
             e, told = self.residuals(view, center, seen)
-            # Only samples that have a prediction here and to all sides have a say: the others are not asked again.
+            # Only samples with a prediction at the centre and at all displaced centres are used.
             seen, e = (seen[0][told], seen[1][told]), e[told]
             columns, told = [], np.ones(len(e), bool)
             for axis in np.eye(3):
@@ -329,14 +339,14 @@ class _Task:
         return matrix, vector, squares / max(weights, 1e-12)
 
     def descend(self, center: Array, scale: float) -> Array:
-        """Gauss-Newton, its steps shortened until they lower the cost."""
+        """Minimise by Gauss-Newton, with steps shortened until they lower the cost."""
         cost, count = self.cost(center, scale)
         for _ in range(STEPS):
             matrix, vector, _ = self.normal_equations(center, scale)
             step = -np.linalg.solve(matrix + (1e-9 * np.trace(matrix) + 1e-12) * np.eye(3), vector)
             step *= min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-12))
             for _ in range(4):
-                # Fewer samples are cheaper to explain: the ball must not turn its back on the receiver.
+                # Fewer samples are easier to explain: the solution must not turn the ball away from the receiver.
                 better, left = self.cost(center + step, scale)
                 if better < cost and left >= 0.8 * count:
                     break
@@ -358,18 +368,18 @@ def fit_ball(
     *,
     search: float = 0.01,
 ) -> BallFit | None:
-    """Find a ball near where it is said to be.
+    """Find a ball near its given position.
 
     Args:
         frames: uint8 RGB pictures with ``camera_from_world``; one is enough, several from different sides are better.
         camera: The camera of all of them.
-        probe: The ball: a rough centre, the radius and the reflectance.
-        proxies: What stands on the receiver; without planes or boxes a desk at the marker's height is assumed.
+        probe: The ball with an approximate centre, the radius and the reflectance.
+        proxies: Proxies of the scene; without planes or boxes, a plane at the marker's height is assumed.
         others: Other balls.
-        search: Metres around the rough centre, along x and y, in which the ball is looked for.
+        search: Half width in metres, along x and y, of the searched region around the approximate centre.
 
     Returns:
-        The fit, or None where too little of the receiver is mirrored; look at ``is_good`` before believing it.
+        The fit, or None if too little of the receiver is mirrored. Check ``is_good`` before using it.
     """
     fine = _Task(prepare_views(frames, camera), probe, _Receiver(proxies, others))
     coarse = dataclasses.replace(fine, is_coarse=True)
@@ -400,7 +410,7 @@ def fit_ball(
 
 
 def prepare_views(frames: Sequence[tuple[Image, Pose]], camera: Camera) -> tuple[BallView, ...]:
-    """Frames, RGB uint8 with ``camera_from_world``, prepared once for all balls that are tried."""
+    """Prepare frames, RGB uint8 with ``camera_from_world``, once for all balls that are tried."""
     table = decode_table(camera.transfer)
     return tuple(BallView(image, pose, camera, table) for image, pose in frames)
 
@@ -408,16 +418,16 @@ def prepare_views(frames: Sequence[tuple[Image, Pose]], camera: Camera) -> tuple
 def mirrored_error(
     views: Sequence[BallView], probe: Probe, proxies: Sequence[Proxy] = (), others: Sequence[Probe] = ()
 ) -> tuple[float, Array] | None:
-    """Return how badly a ball of a radius explains what frames show it to mirror, at the best place beside its own.
+    """Return how badly a ball of a given radius explains its mirror image in the frames, at the best nearby centre.
 
     Args:
         views: The frames.
-        probe: The ball, its centre within some millimetres.
-        proxies: What stands on the receiver; without planes or boxes a desk at the marker's height is assumed.
+        probe: The ball, with a centre accurate to a few millimetres.
+        proxies: Proxies of the scene; without planes or boxes, a plane at the marker's height is assumed.
         others: Other balls.
 
     Returns:
-        Mean cost, 0 (all samples agree) to 1, and the centre (3,); None where too little of the receiver is mirrored.
+        Mean cost, 0 (all samples agree) to 1, and the centre (3,); None if too little of the receiver is mirrored.
     """
     task = _Task(views, probe, _Receiver(proxies, others))
     center: Array = np.array(probe.center, np.float64)
@@ -435,13 +445,13 @@ def mirrored_radius(
     proxies: Sequence[Proxy],
     others: Sequence[Probe] = (),
 ) -> Probe | None:
-    """The ball with the radius, and the centre, that explain best what it mirrors; None where that does not tell.
+    """Return the ball with the radius and centre that best explain its mirror image; None if they are not determined.
 
     Args:
         views: RGB frames with ``camera_from_world``.
         camera: The camera.
-        probe: The ball as it is given: it stands, its radius is within ``SPAN``, its centre within millimetres.
-        proxies: What stands on the receiver.
+        probe: The given ball: it stands on a surface, its radius is accurate to ``SPAN``, its centre to millimetres.
+        proxies: Proxies of the scene.
         others: Other balls.
     """
     few = prepare_views(views[:: -(-len(views) // RADIUS_VIEWS)], camera)
@@ -450,7 +460,7 @@ def mirrored_radius(
     balls: dict[int, Probe] = {}
 
     def attempt(k: int, place: tuple[float, float, float]) -> None:
-        """Try a radius from a place, and still on the ground."""
+        """Evaluate radius number ``k`` from an initial centre, with the ball still on the ground."""
         radius = probe.radius * (1.0 + RADIUS_STEP * k)
         start = (place[0], place[1], probe.center[2] + radius - probe.radius)
         ball = dataclasses.replace(probe, center=start, radius=radius)
@@ -459,7 +469,7 @@ def mirrored_radius(
             x, y, z = (float(value) for value in found[1])
             costs[k], balls[k] = found[0], dataclasses.replace(ball, center=(x, y, z))
 
-    # One of the first few is within four steps of the right radius, and explains more than nothing.
+    # One of the first few radii is within four steps of the right one, and is better than no ball.
     first = [k for k in range(-steps, steps + 1) if k % 4 == 3 and abs(k) < steps]
     for k in first:
         attempt(k, probe.center)
@@ -468,7 +478,7 @@ def mirrored_radius(
     for k in range(-steps, steps + 1, 2):
         if k not in first:
             attempt(k, probe.center)
-    # From the best one outward, each from its neighbour's place.
+    # Outward from the best radius, each starting from its neighbour's centre.
     best = min(costs, key=lambda k: costs[k])
     for way in (1, -1):
         for k in range(best + way, best + (ASIDE + 2) * way, way):
@@ -494,7 +504,7 @@ def explains_better(
     proxies: Sequence[Proxy],
     others: Sequence[Probe] = (),
 ) -> bool:
-    """Return whether a ball explains what is mirrored, and much better than another one does."""
+    """Return True if a ball explains the mirror image, and much better than another ball does."""
     few = prepare_views(views[:: -(-len(views) // RADIUS_VIEWS)], camera)
     found = [mirrored_error(few, ball, proxies, others) for ball in (probe, other)]
     if found[0] is None or found[0][0] > EXPLAINED:
@@ -503,13 +513,13 @@ def explains_better(
 
 
 def posed_frames(source: Source, marker: Marker, camera: Camera, most: int) -> list[tuple[Image, Pose]]:
-    """Frames of a source in which the marker is seen well, with their poses; of alternating exposures the longest.
+    """Return frames with a well visible marker and their poses; of alternating exposures, those of the longest.
 
     Args:
-        source: It is read from its start, if it has one.
-        marker: What to look for.
-        camera: Of the source's size.
-        most: Frames to look at.
+        source: Source of frames; recorded ones are read from their start.
+        marker: The marker or board.
+        camera: Camera at the source's frame size.
+        most: Largest number of frames to read.
     """
     tracker = Tracker(marker, camera)
     found = []
@@ -523,15 +533,15 @@ def posed_frames(source: Source, marker: Marker, camera: Camera, most: int) -> l
 
 
 def refine_balls(scene: Scene, source: Source, *, frames: int = 24) -> tuple[Scene, tuple[BallFit | None, ...]]:
-    """The scene with its balls where the source shows them, as far as that is certain.
+    """Return the scene with its balls where the frames show them, as far as that is certain.
 
     Args:
-        scene: Its balls within 6 mm of where they are.
-        source: The frames; those of a device are gone afterwards.
-        frames: How many to look at; of those that show the marker, ``REFINE_VIEWS`` are compared.
+        scene: Scene whose balls are accurate to 6 mm.
+        source: Source of frames; a device's frames are consumed.
+        frames: Number of frames to read; ``REFINE_VIEWS`` of those that show the marker are compared.
 
     Returns:
-        The scene, and what was found for each ball; a fit that is not ``is_good`` has moved nothing.
+        The scene, and the fit of each ball. A ball whose fit is not ``is_good`` is not moved.
     """
     camera = scene.camera.scaled_to(*source.size)
     views = posed_frames(source, scene.marker, camera, frames)

@@ -1,12 +1,13 @@
-"""The outline of a mirror ball in a photograph, to a fraction of a pixel, with its uncertainty.
+"""Outline of a mirror ball in a photograph, with sub-pixel accuracy and its uncertainty.
 
-From coarse to fine: a rough circle, given or looked for, is corrected in a reduced picture whose ball is
-``COARSE_RADIUS`` pixels, then in ever larger ones, each time by the evidence of ``ball_rim``. The unknowns are those of
-a sphere before the camera, three in all, so that the ellipse that a wide lens makes of a ball costs no further ones.
+The search goes from coarse to fine. An approximate circle, given or found, is refined in a reduced picture where the
+ball's radius is ``COARSE_RADIUS`` pixels, then in increasingly larger pictures, each time by the evidence of
+``ball_rim``. The three unknowns are those of a sphere in front of the camera, so the elliptic outline under a wide lens
+needs no further unknowns.
 
-How far it may be off is told by leaving out one sector of the rim after the other (a delete-a-group jackknife): what
-spoils a rim, a stand, a band of light, a shadow, spoils neighbouring pieces alike, so single pieces must not count as
-independent. Where a model of both sides of the rim and plain steps differ, that is uncertainty as well.
+The uncertainty is estimated by leaving out one sector of the rim after the other (delete-a-group jackknife).
+Disturbances of a rim (a stand, a band of light, a shadow) affect neighbouring pieces equally, so single pieces are not
+independent. The difference between the two-sided model of the rim and plain step detection is added to the uncertainty.
 """
 
 from __future__ import annotations
@@ -38,84 +39,85 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SMALLEST_PICTURE = 24
-"""Pixels along the shorter side below which no picture shows a ball: noise fits any circle then."""
+"""Shorter side of a picture in pixels below which no ball is searched, because noise then fits any circle."""
 COARSE_RADIUS = 48.0
-"""Pixels of the ball in the smallest picture that is looked at."""
+"""Radius in pixels of the ball in the smallest reduced picture."""
 ROUGH_ERROR = 0.22
-"""Share of the radius by which a rough circle may be off."""
+"""Relative error of an approximate circle, as a share of its radius."""
 BLURS = (0.45, 0.6, 0.75, 0.95, 1.3, 1.8)
-"""Standard deviations, pixels, of the picture's blur that are tried at full size."""
+"""Standard deviations in pixels of the picture's blur that are tried at full size."""
 STARTS = 4
-"""Places from which a search descends: a mirrored edge makes a circle of its own, often a stronger one."""
+"""Number of candidates from which a search descends, because a mirrored edge often gives a stronger circle than the
+rim."""
 SEARCHED = 1600.0
-"""Pixels along the longer side of the picture in which a ball is looked for."""
+"""Longer side in pixels of the picture in which a ball is searched."""
 DIM_SUPPORT = 0.4
-"""Share of the rim that is seen, below which a person should look as well."""
+"""Visible share of the rim below which a person should check the result."""
 TINY = 24.0
-"""Pixels of the radius below which many things look like a ball."""
+"""Radius in pixels below which many objects resemble a ball."""
 SEARCHES = 16
-"""Proposed circles from which a ball is looked for in a whole picture."""
+"""Number of proposed circles from which a ball is searched in a whole picture."""
 CERTAIN = 9.0
-"""Evidence from which on no further circle is looked at, as most pictures of a ball have it and few others."""
+"""Evidence above which no further circle is examined; most pictures of a ball reach it, few others do."""
 LEAST_EVIDENCE = 6.0
-"""Evidence below which there is no ball. From here to ``CERTAIN`` a person should look: most are right."""
+"""Smallest evidence for a ball. Between it and ``CERTAIN``, a person should check the result, which is mostly right."""
 UNSURE = 0.02
-"""Share of the radius by which a doubtless outline's place and radius may be off, one standard deviation."""
+"""Largest standard deviation of position and radius, relative to the radius, of an outline without doubt."""
 DARK = 6.0
-"""Codes below which a lifted picture is no logarithm any more: there is noise."""
+"""Code below which a lifted picture is not logarithmic, because of noise."""
 LARGEST_RADIUS = 700.0
-"""Pixels: a larger ball is measured in a reduced picture; a fifth of a pixel is more than a lens is good for then."""
+"""Radius in pixels above which a ball is measured in a reduced picture; lens errors then exceed a fifth of a pixel."""
 ALIKE = 0.06
-"""Difference of mean log likelihoods of a piece within which two blurs explain a rim alike."""
+"""Difference of mean log likelihoods per piece within which two blurs are equally likely."""
 LEAST_DEVIATION = 0.08
-"""Pixels that leaving sectors out does not tell of: what is mirrored at the rim is not quite what the model says."""
+"""Smallest standard deviation in pixels: model errors at the rim that the jackknife does not show."""
 PIECES = 240
-"""Pieces that a rim is cut into."""
+"""Number of pieces of a rim."""
 COMPRESSION = 1.0
-"""Weight of the radial compression inside a rim against the steps across it."""
+"""Weight of the radial compression inside a rim relative to the steps across it."""
 BEHIND = -4.0
-"""Compression of a ball that is not wholly before the camera: less than any that is."""
+"""Compression assigned to a ball partly behind the camera; lower than any real one."""
 TOGETHER = 64
-"""Outlines whose compression is looked at together: more do not stay in a core's cache."""
+"""Number of outlines whose compression is computed together; more would not fit the core's cache."""
 SECTORS = 12
-"""Sectors of the rim that are left out in turn."""
+"""Number of sectors of the rim that are left out in turn."""
 LEAST_SUPPORT = 0.2
-"""Share of the rim that must be seen to be one."""
+"""Smallest visible share of a rim."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BallOutline:
-    """A ball's silhouette in a picture."""
+    """Silhouette of a ball in a picture."""
 
     center: tuple[float, float]
     """Centre of the ellipse, pixels (column, row)."""
     axes: tuple[float, float]
-    """Half axes of the ellipse in pixels, the longer first."""
+    """Half axes of the ellipse in pixels, longer axis first."""
     angle: float
-    """Direction of the longer axis in degrees, from the picture's x to its y."""
+    """Direction of the longer axis in degrees, from the picture's x axis toward its y axis."""
     deviation: tuple[float, float, float]
-    """Standard deviations of column, row and radius, pixels."""
+    """Standard deviations of column, row and radius in pixels."""
     support: float
-    """Share of the rim in view that speaks for it."""
+    """Share of the rim in view that supports the outline."""
     sphere: tuple[float, float, float]
-    """The ball's centre in the camera's frame over its radius."""
+    """Centre of the ball in the camera's frame, divided by its radius."""
     evidence: float = math.inf
-    """Likeness to a mirror ball, where the whole picture was searched; else infinite."""
+    """Similarity to a mirror ball if the whole picture was searched; else infinite."""
 
     @property
     def is_doubtful(self) -> bool:
-        """Return whether something else may have been taken for the ball: most such outlines are right, but not all."""
+        """Return True if another object may have been taken for the ball; most such outlines are still right."""
         dim = self.support < DIM_SUPPORT or self.radius < TINY
         searched = math.isfinite(self.evidence) and (self.evidence < CERTAIN or dim)
         return searched or max(self.deviation) > UNSURE * self.radius
 
     @property
     def radius(self) -> float:
-        """Mean radius in pixels."""
+        """Return the mean radius in pixels."""
         return math.sqrt(self.axes[0] * self.axes[1])
 
     def points(self, count: int = PIECES) -> Array:
-        """The outline, (count, 2) pixels."""
+        """Return the outline, (count, 2) pixels."""
         angle = 2 * np.pi * np.arange(count) / count
         c, s = math.cos(math.radians(self.angle)), math.sin(math.radians(self.angle))
         local = np.column_stack([self.axes[0] * np.cos(angle), self.axes[1] * np.sin(angle)])
@@ -123,13 +125,13 @@ class BallOutline:
 
 
 def far_camera(width: int, height: int) -> Camera:
-    """A camera whose perspective is not known: so far away that a ball is a circle."""
+    """Return a camera for pictures without known perspective, so distant that a ball's outline is a circle."""
     focal = 30.0 * max(width, height)
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def silhouette(camera: Camera, sphere: Array, count: int = PIECES) -> tuple[Array, Array]:
-    """Outline (count, 2) in pixels and outward unit normals of a ball at ``sphere`` (centre over radius)."""
+    """Return the outline (count, 2) in pixels and outward unit normals of a ball at ``sphere`` (centre over radius)."""
     if not _is_before(sphere[None])[0]:
         return np.zeros((0, 2)), np.zeros((0, 2))
     pixels, normals = silhouettes(camera, sphere[None], count)
@@ -137,14 +139,14 @@ def silhouette(camera: Camera, sphere: Array, count: int = PIECES) -> tuple[Arra
 
 
 def _is_before(spheres: Array) -> NDArray[np.bool_]:
-    """Return which spheres (m, 3) are wholly before the camera."""
+    """Return a mask of spheres (m, 3) that are entirely in front of the camera."""
     return np.asarray((np.linalg.norm(spheres, axis=1) > 1.0) & (spheres[:, 2] > 1.0))
 
 
 def silhouettes(camera: Camera, spheres: Array, count: int = PIECES) -> tuple[Array, Array]:
-    """Outlines (m, count, 2) in pixels and outward unit normals of balls (m, 3), all wholly before the camera.
+    """Return outlines (m, count, 2) in pixels and outward unit normals of balls (m, 3) in front of the camera.
 
-    Together, for a search asks for thousands, and NumPy takes as long for a few numbers as for hundreds.
+    All are computed together: a search needs thousands, and NumPy takes as long for a few numbers as for hundreds.
     """
     d = np.linalg.norm(spheres, axis=1, keepdims=True)
     n = spheres / d
@@ -152,23 +154,23 @@ def silhouettes(camera: Camera, spheres: Array, count: int = PIECES) -> tuple[Ar
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     angle = 2 * np.pi * np.arange(count)[:, None] / count
     spokes = np.cos(angle) * u[:, None] + np.sin(angle) * np.cross(n, u)[:, None]
-    # Rays that touch the ball touch it on a circle: centre c - n / d, radius sqrt(1 - 1 / d^2).
+    # Rays tangent to the ball touch it on a circle with centre c - n / d and radius sqrt(1 - 1 / d^2).
     rim = (spheres - n / d)[:, None] + np.sqrt(1.0 - 1.0 / (d * d))[:, None] * spokes
     pixels = project(camera, rim.reshape(-1, 3)).reshape(len(spheres), count, 2)
-    # The rim turns from x to y, about the axis away from the camera: right of its way is outward.
+    # The rim runs from x to y about the axis away from the camera: outward is to the right of its direction.
     tangent = np.roll(pixels, -1, 1) - np.roll(pixels, 1, 1)
     normal = np.stack([tangent[..., 1], -tangent[..., 0]], -1)
     return pixels, normal / np.maximum(np.hypot(normal[..., 0], normal[..., 1]), 1e-9)[..., None]
 
 
 def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array:
-    """Centre over radius, (3,), of the ball whose silhouette is about a circle in the picture."""
+    """Return centre over radius, (3,), of the ball whose silhouette is approximately a circle in the picture."""
     around = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
     circle = np.array([[x + dx * radius, y + dy * radius] for dx, dy in around], float)
     flat = undistorted(camera, circle)
     rays = np.column_stack([flat, np.ones(4)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    # Opposite rays of the cone: its axis halves them.
+    # The cone's axis bisects the angle between opposite rays.
     axis = rays[:2].sum(0) / np.linalg.norm(rays[:2].sum(0)) + rays[2:].sum(0) / np.linalg.norm(rays[2:].sum(0))
     axis /= np.linalg.norm(axis)
     half = float(np.arccos(np.clip(rays @ axis, -1.0, 1.0)).mean())
@@ -176,7 +178,7 @@ def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array
 
 
 def _steps(camera: Camera, sphere: Array) -> Array:
-    """Columns: changes of a sphere (3, 3) that move its outline by a pixel right, down and outward."""
+    """Return columns (3, 3): changes of a sphere that move its outline by a pixel right, down and outward."""
     scale = 1.0 / math.hypot(*sphere)
     pixels, _ = silhouette(camera, sphere, 16)
     columns = []
@@ -189,10 +191,10 @@ def _steps(camera: Camera, sphere: Array) -> Array:
 
 
 class _Fit:
-    """A ball's sphere against one picture's evidence about a base outline."""
+    """Cost of a ball's sphere by one picture's evidence around a base outline."""
 
     def __init__(self, image: Image, camera: Camera, base: Array, shift: float, blur: float | None = None) -> None:
-        """Look at the picture; without a ``blur`` only for steps, to find the right one of several."""
+        """Gather the evidence; without ``blur`` only steps, to choose among several candidates."""
         self.base = base
         self.steps = _steps(camera, base)
         self.points, self.normals = silhouette(camera, base)
@@ -203,20 +205,20 @@ class _Fit:
             self.evidence = gather_evidence(image, self.points, self.normals, self.radius, shift=shift, blur=blur)
 
     def shifts(self, moves: Array) -> Array:
-        """Along the normals, pixels (m, n), when the outline moves by (right, down, outward), (m, 3)."""
+        """Return shifts along the normals, pixels (m, n), of an outline moved by (right, down, outward), (m, 3)."""
         return np.asarray(moves[:, :2] @ self.normals.T + moves[:, 2:])
 
     def costs(self, moves: Array, evidence: RimEvidence | None = None) -> Array:
-        """Costs (m,) of moves (m, 3)."""
+        """Return the costs (m,) of moves (m, 3)."""
         return (evidence or self.evidence).totals(self.shifts(moves))
 
     def spheres(self, moves: Array) -> Array:
-        """Spheres (m, 3) of moves (m, 3), or the sphere (3,) of one."""
+        """Return the spheres (m, 3) after moves (m, 3), or the sphere (3,) after one."""
         return np.asarray(self.base + moves @ self.steps.T)
 
 
 def _reduced(image: Image, camera: Camera, share: float) -> tuple[Image, Camera]:
-    """Picture and camera at a share of their size, with whole pixels."""
+    """Return picture and camera scaled by ``share``, with whole pixels."""
     if share >= 1.0:
         return image, camera
     height, width = image.shape[:2]
@@ -230,7 +232,7 @@ def _reduced(image: Image, camera: Camera, share: float) -> tuple[Image, Camera]
 
 
 def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: float) -> Array:
-    """The sphere with the most rim among all whose outline is within ``shift`` pixels in every unknown."""
+    """Return the sphere with the most rim whose outline is within ``shift`` pixels in every unknown."""
     slopes, fit = gradients(image), _Fit(image, camera, sphere, math.ceil(2.0 * shift))
 
     def compressions(moves: Array) -> Array:
@@ -253,7 +255,7 @@ def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: flo
 
 
 def _apart(places: Array, costs: Array, distance: float) -> list[int]:
-    """The cheapest ``STARTS`` places that are further than ``distance`` from each other."""
+    """Return the indices of the cheapest ``STARTS`` places farther than ``distance`` from each other."""
     chosen: list[int] = []
     for k in np.argsort(costs):
         if all(np.abs(places[k] - places[other]).max() > distance for other in chosen):
@@ -269,23 +271,23 @@ def _radius(camera: Camera, sphere: Array) -> float:
 
 
 def _coarse(image: Image, camera: Camera, sphere: Array, rough_error: float) -> Array:
-    """The best sphere within ``rough_error`` of a rough one, looked for everywhere in a small picture."""
+    """Return the best sphere within ``rough_error`` of an approximate one, searched exhaustively in a small picture."""
     radius = _radius(camera, sphere)
     small, view = _reduced(image, camera, COARSE_RADIUS / radius)
     return _search(small, view, sphere, rough_error * min(radius, COARSE_RADIUS), 2.0)
 
 
 def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float = LARGEST_RADIUS) -> BallOutline:
-    """The outline near a sphere that is within some percent of right, with its uncertainty.
+    """Refine the outline near a sphere that is accurate to a few percent, and estimate its uncertainty.
 
     Args:
         image: 8-bit RGB.
-        camera: It took the picture.
+        camera: Camera of the picture.
         sphere: Centre over radius, (3,), in the camera's frame.
-        largest: A ball of a larger radius, in pixels, is measured in a reduced picture.
+        largest: Radius in pixels above which the ball is measured in a reduced picture.
 
     Raises:
-        UsageError: What is found is no ball before the camera.
+        UsageError: The result is not a ball in front of the camera.
     """
     image, camera, corner = _window(image, camera, sphere)
     radius = _radius(camera, sphere)
@@ -293,7 +295,7 @@ def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float =
     for octave in range(max(math.ceil(math.log2(finest / share)), 1)):
         picture, view = _reduced(image, camera, min(2.0 ** (octave + 1) * share, finest))
         sphere = _search(picture, view, sphere, 2.0, 1.0)
-    # A wider blur moves the rim inward by as much as it is wider: what the picture cannot tell apart is uncertainty.
+    # A wider blur moves the rim inward by the same amount; blurs that are equally likely add to the uncertainty.
     tried = []
     for blur in BLURS:
         fit = _Fit(picture, view, sphere, 1.5, blur)
@@ -302,7 +304,7 @@ def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float =
     least = min(cost for cost, _, _ in tried)
     likely = [(move, blur) for cost, move, blur in tried if cost < least + ALIKE]
     unsure = np.std([move[2] for move, _ in likely])
-    # Once more about what was found, so that normals and window are those of the outline itself.
+    # Repeated around the result, so that normals and window are those of the outline itself.
     move, blur = likely[(len(likely) - 1) // 2]
     fit = _Fit(picture, view, fit.spheres(move), 1.5, blur)
     move, _ = descend(fit.costs, np.zeros(3), 0.2, 0.01)
@@ -310,7 +312,7 @@ def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float =
     rest = [functools.partial(fit.costs, evidence=fit.evidence.without(sector == k)) for k in range(SECTORS)]
     left = np.stack([descend(costs, move, 0.1, 0.01)[0] for costs in rest])
     spread = np.sqrt((SECTORS - 1) / SECTORS * ((left - left.mean(0)) ** 2).sum(0)) + LEAST_DEVIATION
-    # Where steps are, whatever lies on either side, is a second opinion: models that differ are uncertainty too.
+    # Plain step detection is a second opinion; its difference from the model adds to the uncertainty.
     steps = _Fit(picture, view, fit.spheres(move), 1.0)
     other, _ = descend(steps.costs, np.zeros(3), 0.4, 0.02)
     spread = np.sqrt(spread**2 + np.array([0.0, 0.0, unsure]) ** 2 + other**2) / finest
@@ -319,7 +321,7 @@ def refine_outline(image: Image, camera: Camera, sphere: Array, largest: float =
 
 
 def _window(image: Image, camera: Camera, sphere: Array) -> tuple[Image, Camera, tuple[int, int]]:
-    """The part of a picture that a ball's outline may lie in, its camera, and its corner's column and row."""
+    """Return the part of a picture that may contain a ball's outline, its camera, and its corner's column and row."""
     points, _ = silhouette(camera, sphere, 32)
     low, high = points.min(0), points.max(0)
     margin = 0.35 * (high - low).max() + 24.0
@@ -337,16 +339,16 @@ def _describe(camera: Camera, sphere: Array, spread: Array, support: float) -> B
     (x, y), (a, b), angle = cv2.fitEllipseDirect(points.astype(np.float32)[:, None])
     if a < b:
         a, b, angle = b, a, angle + 90.0
-    # OpenCV's fit is in single precision: the centre by the points' mean over equal angles is no better than it.
+    # OpenCV's ellipse fit is in single precision; its centre is as exact as the mean of points at equal angles.
     dx, dy, dr = map(float, spread)
     cx, cy, cz = map(float, sphere)
     return BallOutline((float(x), float(y)), (a / 2, b / 2), angle % 180.0, (dx, dy, dr), support, (cx, cy, cz))
 
 
 def lifted(image: Image) -> Image:
-    """The picture with darks as steep as brights: its codes are logarithms.
+    """Return the picture with logarithmic codes, so that dark and bright edges have equal contrast.
 
-    In a bracket's short exposures a rim is a few codes high, beside lamps of two hundred.
+    In a bracket's short exposures, a rim has a contrast of a few codes, next to lamps of two hundred.
     """
     return np.asarray(_LIFT[image])
 
@@ -358,9 +360,9 @@ def find_ball(
 
     Args:
         image: uint8 RGB (height, width, 3).
-        camera: The camera, if known; else the ball is taken for a circle.
-        rough: Column, row and radius in pixels of a circle that is about right; None: look for the ball.
-        rough_error: Share of the radius by which ``rough`` may be off.
+        camera: The camera, if known; else the outline is assumed to be a circle.
+        rough: Column, row and radius in pixels of an approximate circle; None: search the picture.
+        rough_error: Error of ``rough``, as a share of its radius.
 
     Raises:
         UsageError: No ball is found, the picture is too small, or the circle lies outside of it.
@@ -383,10 +385,10 @@ def find_ball(
 
 
 def exact_outline(image: Image, camera: Camera, circle: Sequence[float]) -> BallOutline:
-    """Return the outline that a circle (column, row, radius in pixels) is, as it was given.
+    """Return the outline of exactly the given circle (column, row, radius in pixels).
 
     Raises:
-        UsageError: There is no such ball before the camera.
+        UsageError: No ball in front of the camera has this outline.
     """
     sphere = _sphere_of_given(image, camera, circle)
     steps = _Fit(image, camera, sphere, 1.0).evidence
@@ -394,10 +396,10 @@ def exact_outline(image: Image, camera: Camera, circle: Sequence[float]) -> Ball
 
 
 def _sphere_of_given(image: Image, camera: Camera, rough: Sequence[float]) -> Array:
-    """Return the sphere of a circle that was given.
+    """Return the sphere of a given circle.
 
     Raises:
-        UsageError: The circle is none, or lies outside of the picture.
+        UsageError: The circle is invalid, or outside the picture.
     """
     height, width = image.shape[:2]
     if len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0:
@@ -414,15 +416,16 @@ def _sphere_of_given(image: Image, camera: Camera, rough: Sequence[float]) -> Ar
 
 
 def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
-    """The likeliest ball of a whole picture."""
+    """Return the likeliest ball in the whole picture."""
     small, view = _reduced(image, camera, SEARCHED / max(image.shape))
     height, width = small.shape[:2]
-    # And a crop of a ball alone: as wide as the picture.
+    # Also a circle as wide as the picture, for a crop of the ball alone.
     circles = [*propose_circles(small), ((width - 1) / 2, (height - 1) / 2, 0.48 * min(width, height))]
     starts = [sphere_of_circle(view, *circle) for circle in circles]
     tries = [(lift, start) for lift in (False, True) for start in starts if start[2] > 1.0]
     pictures = small, lifted(small)
-    # What is worth a search is told by what the proposed circle itself shows: a mirrored edge may be one inside it.
+    # Candidates are ranked by the evidence of the proposed circle itself; the ball's rim may be outside a mirrored
+    # edge.
     tries = sorted(tries, key=lambda item: -rim_strength(pictures[item[0]], view, item[1]))[:SEARCHES]
     best, told = None, -math.inf
     for lift, start in tries:
@@ -439,7 +442,7 @@ def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
     picture = lifted(image) if lift else image
     outline = refine_outline(picture, camera, sphere)
     if outline.support < LEAST_SUPPORT and (reduced := _refine_reduced(picture, camera, outline)) is not None:
-        outline, told = reduced, min(told, LEAST_EVIDENCE)  # right for soft photographs, but not beyond doubt
+        outline, told = reduced, min(told, LEAST_EVIDENCE)  # mostly right for soft photographs, but doubtful
     outline = dataclasses.replace(outline, evidence=told)
     if told < LEAST_EVIDENCE or outline.support < LEAST_SUPPORT:
         raise _unseen(outline, ask)
@@ -447,12 +450,15 @@ def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
 
 
 def _refine_reduced(image: Image, camera: Camera, outline: BallOutline) -> BallOutline | None:
-    """The outline in as large a picture as shows the rim, which noise or a soft lens hides in larger ones."""
+    """Return the outline in the largest reduced picture that shows the rim.
+
+    Noise or a soft lens hides it in larger ones.
+    """
     largest = 0.5 * min(outline.radius, LARGEST_RADIUS)
     while largest >= COARSE_RADIUS:
         reduced = refine_outline(image, camera, np.array(outline.sphere), largest)
         if reduced.support >= DIM_SUPPORT:
-            return reduced  # there it must be seen well: every desk has circles that are seen a little
+            return reduced  # the rim must be clearly visible: every scene has faint circles
         largest *= 0.5
     return None
 
@@ -466,14 +472,14 @@ def _unseen(outline: BallOutline, ask: str) -> UsageError:
 
 
 def rim_strength(image: Image, camera: Camera, sphere: Array) -> float:
-    """Return how much of a ball is seen at a sphere: steps at its rim, compression inside, more for larger ones.
+    """Return the evidence for a ball at a sphere: steps at the rim and compression inside, more for larger balls.
 
-    A plate, a lid or a mirrored horizon has as sharp a rim as a ball. Only in a ball is what is inside squeezed toward
-    it, so that counts twice.
+    A plate, a lid or a mirrored horizon has as sharp a rim as a ball. Only a ball compresses its reflections toward the
+    rim, so the compression has twice the weight.
 
     Args:
-        image: 8-bit RGB, in which the ball is looked at ``COARSE_RADIUS`` pixels large.
-        camera: It took the picture.
+        image: 8-bit RGB; it is reduced so that the ball's radius is ``COARSE_RADIUS`` pixels.
+        camera: Camera of the picture.
         sphere: Centre over radius, (3,), in the camera's frame.
     """
     radius = _radius(camera, sphere)
@@ -484,7 +490,7 @@ def rim_strength(image: Image, camera: Camera, sphere: Array) -> float:
     if not fit.evidence.known.any():
         return -math.inf
     compression = radial_compression(gradients(small), fit.points[None], fit.normals[None], np.array([fit.radius]))
-    # The gain of a step over a smooth curve in explaining the pieces of the rim.
+    # Improvement of a step over a smooth curve, as a model of the rim's pieces.
     steps = MOST_COST - float(fit.costs(np.zeros((1, 3)))[0])
     size = 1.0 + 0.1 * math.log(max(radius, 4.0))
     return (steps + 2.0 * float(compression[0])) * float(fit.evidence.known.mean()) * size

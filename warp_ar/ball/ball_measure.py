@@ -1,8 +1,9 @@
-"""A mirror ball's centre and radius with intervals that hold: its outlines first, then the receiver that it mirrors.
+"""Centre and radius of a mirror ball with reliable intervals: first by its outlines, then by its mirror image.
 
-The mirrored receiver gives the centre within a fraction of a millimetre, but only for the radius that is assumed: a
-radius 1 mm wrong moves that centre by ``SLOPE`` millimetres, mostly along the line of sight, and its own interval does
-not tell. So the radius comes from the outlines, and what is uncertain of it is added to the centre's interval.
+The mirror image of the receiver gives the centre to a fraction of a millimetre, but only for the assumed radius. A
+radius error of 1 mm moves that centre by ``SLOPE`` millimetres, mostly along the line of sight, and its own interval
+does not include this. Therefore the radius comes from the outlines, and its uncertainty is added to the centre's
+interval.
 """
 
 from __future__ import annotations
@@ -23,39 +24,39 @@ from warp_ar.scene import Camera, Pose, Probe, Proxy
 Image = NDArray[np.uint8]
 
 SLOPE = 1.8
-"""Metres that the centre moves for each metre that the radius is wrong."""
+"""Displacement of the centre, in metres, per metre of radius error."""
 OUTLINES = 6
-"""Frames whose outlines are looked for: each takes half a second."""
+"""Number of frames in which outlines are searched; each takes half a second."""
 SEARCH = 5e-3
-"""Metres around the outlines' centre in which the mirrored receiver is compared."""
+"""Radius in metres around the outlines' centre in which the mirror image is compared."""
 ASSUMED = 0.01
-"""Share of a radius that is only assumed by which it may be off: a ruler's error."""
+"""Relative error of an assumed radius: that of a ruler."""
 MOST = 0.1
-"""Share of the radius that its interval may have, and half of what the centre's may, for a ball to be used."""
+"""Largest interval of the radius, relative to it, for a usable ball; the centre's may be twice as large."""
 DOUBT = 0.025
-"""Share of the radius by which outlines may differ from what was typed before the mirrored receiver is asked."""
+"""Relative difference of radii from the given one above which the mirror image is examined as well."""
 STRAY = 1.0 / 3.0
-"""Share of the given radius beyond which outlines are not those that were looked for, but of rings on the card."""
+"""Relative difference from the given radius above which an outline is another circle, such as a ring on the card."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BallMeasurement:
-    """A measured mirror ball; metres, in the marker's frame."""
+    """Measured mirror ball; metres, in the marker's frame."""
 
     center: tuple[float, float, float]
-    """Centre."""
+    """Centre, (x, y, z)."""
     deviation: float
-    """Standard deviation of the centre along its worst axis."""
+    """Standard deviation of the centre along its least certain axis."""
     radius: float
     """Radius."""
     radius_deviation: float | None
-    """Its standard deviation; None: it was assumed."""
+    """Standard deviation of the radius; None if the radius was assumed."""
     how: str
-    """Source of the numbers, in words."""
+    """Source of the numbers, as a description."""
 
     @property
     def is_usable(self) -> bool:
-        """Return whether radius and centre are known well enough to be put into a scene."""
+        """Return True if radius and centre are certain enough to be written into a scene."""
         return max(2 * (self.radius_deviation or 0.0), self.deviation) <= MOST * self.radius
 
 
@@ -69,19 +70,19 @@ def measure_ball(
     keep_radius: bool = False,
     tell: Callable[[str], None] = lambda words: None,
 ) -> BallMeasurement:
-    """Centre and radius of a mirror ball.
+    """Measure centre and radius of a mirror ball.
 
     Args:
         views: RGB frames with ``camera_from_world``.
         camera: The camera.
-        probe: The ball; its centre within its radius, its radius within a fifth.
-        proxies: What stands on the receiver.
+        probe: The ball; its centre is accurate to its radius, its radius to a fifth.
+        proxies: Proxies of the scene.
         others: Other balls.
-        keep_radius: Believe the probe's radius.
-        tell: Takes what is being looked at, in words, whenever that changes: all of it takes some seconds.
+        keep_radius: True to keep the probe's radius.
+        tell: Function that receives a description of each step; all steps take some seconds.
 
     Raises:
-        UsageError: The ball is in too few frames, or they show what it should stand on instead.
+        UsageError: Too few frames show the ball, or they show the surface below it instead.
     """
     few = views[:: -(-len(views) // OUTLINES)]
     ground = standing_ground(probe, proxies)
@@ -120,7 +121,7 @@ def measure_ball(
         return by_outlines
     spread = math.hypot(better.deviation, SLOPE * deviation)
     x, y, z = (float(value) for value in better.center)
-    # Both are right within their intervals, or the mirrored receiver has been confused with another part of it.
+    # Both agree within their intervals, or the mirror image was matched to another part of the receiver.
     apart = math.dist((x, y, z), by_outlines.center)
     if apart < 3 * math.hypot(spread, own) and spread < own:
         return dataclasses.replace(by_outlines, center=(x, y, z), deviation=spread, how="by the desk in it")
@@ -128,14 +129,14 @@ def measure_ball(
 
 
 def _is_doubtful(solution: BallSolution, probe: Probe, frames: int) -> bool:
-    """Return whether outlines need a second opinion: some are missing, or the ball is not what was given."""
+    """Return True if outlines need a second opinion: some are missing, or the ball differs from the given one."""
     allowed = DOUBT * probe.radius
     moved = max(abs(a - b) for a, b in zip(solution.center[:2], probe.center[:2], strict=True))
     return len(solution.outlines) < frames or abs(solution.radius - probe.radius) > allowed or moved > 2 * allowed
 
 
 def _contradicts(solution: BallSolution, mirrored: Probe) -> bool:
-    """Return whether a ball that explains what is mirrored cannot be the one of the outlines, or is better known."""
+    """Return True if the ball by the mirror image contradicts the outlines' ball, or is more certain."""
     off = DEVIATION * mirrored.radius
     if solution.radius_deviation > 1.5 * off:
         return True

@@ -1,19 +1,19 @@
-"""A hand, or whatever else, that comes between the camera and a mirror ball: what the ball then shows is no light.
+"""Detection of a hand or another object between the camera and a mirror ball, whose pixels then show no light.
 
-What covers a ball covers the surface beside it in the picture as well, and leaves the light alone. So a ball is taken
-to be covered in a frame where, against the frames before,
+An occluder covers the surface next to the ball in the picture as well, and does not change the light. A ball therefore
+counts as covered in a frame if, compared with the frames before,
 
-- points all over the card and the planes show on the median what they showed, within ``QUIET``: the light is the same;
-- of points of planes that are seen beside the ball, ``NEAR_SHARE`` have changed by more than ``CHANGED``;
-- of the ball's disc in the picture, ``DISC_SHARE`` has.
+- the median change of points all over the card and the planes is below ``QUIET``: the light is the same;
+- the share ``NEAR_SHARE`` of the plane points next to the ball in the picture has changed by more than ``CHANGED``;
+- the share ``DISC_SHARE`` of the ball's disc in the picture has changed.
 
-Points keep their places in the world, the disc's cells their places in the disc: a camera that moves turns what the
-ball mirrors, but not what planes show. An emitter that changes is seen in the median, or neither beside the ball. What
-stays for longer than ``PATIENCE`` belongs to the scene and is believed. Changes are logarithms per channel, with the
-camera's own gain taken out.
+Points have fixed places in the world, and cells have fixed places in the ball's disc: a moving camera changes the
+reflections in the ball, but not the planes. An emitter that changes affects the median, or does not affect the points
+next to the ball. An occluder that stays longer than ``PATIENCE`` counts as part of the scene. Changes are logarithms
+per channel, corrected for the camera's gain.
 
-Frames of more than 8 bits are read at their depth: a lamp above white that a white hand covers has changed, though the
-codes of both are 255.
+Frames with more than 8 bits are read at full depth: a white hand in front of a lamp above white is a change, though
+both have code 255.
 """
 
 from __future__ import annotations
@@ -35,73 +35,74 @@ from warp_ar.tracking.drift import codes_around, still_points, under_boxes
 Array = NDArray[np.float64]
 
 QUIET = 0.15
-"""Logarithm by which the median of all points may have changed: a gain that is followed and a tone curve leave 0.1."""
+"""Largest median change of all points, as a logarithm; a tracked gain and a tone curve leave 0.1."""
 CHANGED = 0.4
-"""Logarithm, in the channel that changed most, from which a point or a cell has changed."""
+"""Logarithm, in the channel with the largest change, from which a point or a cell counts as changed."""
 NEAR_SHARE = 0.15
-"""Share of the points beside a ball that have."""
+"""Share of changed points next to a ball from which it may be covered."""
 DISC_SHARE = 0.15
-"""Share of a ball's cells that have."""
+"""Share of changed cells of a ball's disc from which it may be covered."""
 EVERY = 3
-"""Stride through the scene's still points."""
+"""Stride through the scene's static points."""
 LEAST_POINTS = 24
-"""Points that must be seen again, all over."""
+"""Smallest number of points, in all, that must be visible again."""
 LEAST_NEAR = 8
-"""Points that must be seen again beside a ball."""
+"""Smallest number of points next to a ball that must be visible again."""
 PATIENCE = 1.5
-"""Seconds after which what covers a ball is taken for a part of the scene."""
+"""Seconds after which an occluder counts as part of the scene."""
 MEMORY = 0.3
 """Time constant in seconds with which remembered codes follow frames."""
 DISC_SECONDS = 0.008
-"""Least seconds between two tests of the balls' discs: every frame up to 120 frames a second. An object at 1 m/s
-moves 8 mm meanwhile."""
+"""Shortest time in seconds between two tests of the balls' discs: every frame up to 120 frames a second. An object at 1
+m/s moves 8 mm meanwhile."""
 LOOK_SECONDS = 0.1
-"""Least seconds between two tests of the points while no disc changes; they take four times as long as the discs."""
+"""Shortest time in seconds between two tests of the points while no disc changes; they take four times as long as the
+discs."""
 RINGS = (1.2, 1.7, 2.4, 3.4, 5.0)
-"""Radii of the circles on planes around a ball on which points lie, over the ball's."""
+"""Radii of the circles of points on planes around a ball, relative to the ball's radius."""
 BESIDE = (1.1, 3.0)
-"""Distances in the picture from a ball's centre at which points are beside it, over the radius of its disc."""
+"""Range of distances in the picture from a ball's centre of points next to it, relative to the radius of its disc."""
 CELLS = 16
-"""Cells along a ball's disc."""
+"""Number of cells along a ball's disc."""
 DARK = 0.02
-"""Radiance that is added before the logarithm: below it is noise."""
+"""Radiance added before the logarithm, because darker values are noise."""
 
 
 class BallCover:
-    """Tells, frame after frame, whether something covers a ball."""
+    """Detector of occluded mirror balls over the frames."""
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
         """Choose points.
 
         Args:
-            scene: With a marker and a ball.
-            camera: Of the frames.
+            scene: Scene with a marker and a ball.
+            camera: Camera of the frames.
         """
         self.watches = (camera, scene.marker, scene.proxies, scene.probes)
-        """Things that frames are of: the same frames tell those that watch the same, the same."""
+        """Inputs that determine the result for given frames; equal values allow one instance to be shared."""
         self._camera = camera
         self._table = decode_table(camera.transfer).astype(np.float64)
         self._points = np.concatenate([still_points(scene)[0][::EVERY], _points_around(scene)])
         self.forget()
 
     def forget(self) -> None:
-        """Take the next frame for the first."""
+        """Treat the next frame as the first."""
         self._shown: Array | None = None
         self._discs: list[Array] = []
         self._last = self._looked = self._since = 0.0
         self._covered = False
 
     def rests(self, seconds: float) -> bool:
-        """Return whether the last look was so short a time ago that what it found still holds.
+        """Return True if the last test is recent enough to be still valid.
 
         Args:
-            seconds: When the frame was taken.
+            seconds: Time of the present frame.
         """
         return self._shown is not None and 0.0 < abs(seconds - self._last) < DISC_SECONDS
 
     @property
     def is_covered(self) -> bool:
-        """Return whether a ball was covered at the last look."""
+        """Return True if a ball was covered at the last test."""
         return self._covered
 
     def observe(
@@ -113,18 +114,18 @@ class BallCover:
         gain: Array,
         plate: Plate | None = None,
     ) -> bool:
-        """Look at a frame.
+        """Test a frame.
 
         Args:
             image: uint8 RGB (height, width, 3).
             discs: Centre x, y and radius of each ball in the picture, pixels.
             pose: ``camera_from_world``.
-            seconds: When it was taken.
-            gain: Of the camera, RGB.
-            plate: The frame at its full depth, read in the place of ``image`` where there is one.
+            seconds: Time of the frame.
+            gain: Gain of the camera, RGB.
+            plate: The frame at full depth, used instead of ``image`` if given.
 
         Returns:
-            Whether a ball is covered.
+            True if a ball is covered.
         """
         own = [self._cells(image, disc, gain, plate) for disc in discs]
         known = self._shown is not None and len(own) == len(self._discs)
@@ -151,7 +152,7 @@ class BallCover:
     def _is_covered(
         self, shown: Array, changed: list[bool], discs: Sequence[tuple[float, float, float]], pose: Pose
     ) -> bool:
-        """Return whether a ball is covered, by what points show now and showed before, and which discs changed."""
+        """Return True if a ball is covered, by the present and remembered codes of points and the changed discs."""
         assert self._shown is not None
         change = shown - self._shown
         seen = ~np.isnan(change).any(axis=1)
@@ -174,7 +175,7 @@ class BallCover:
     def _cells(
         self, image: NDArray[np.uint8], disc: tuple[float, float, float], gain: Array, plate: Plate | None = None
     ) -> Array:
-        """Logarithm of what a disc's cells show, four samples of each, NaN beyond the picture, (cells, 3)."""
+        """Return the logarithm of a disc's cells, four samples of each, (cells, 3); NaN outside the picture."""
         picture: NDArray[Any] = image if plate is None else plate.picture
         x, y, radius = disc
         radius = max(radius, 1.0)
@@ -193,13 +194,16 @@ class BallCover:
         return np.asarray(found)
 
     def _logarithm(self, codes: Array, gain: Array) -> Array:
-        """Of the radiance that codes stand for at gain 1, (n, 3)."""
+        """Return the logarithm of the radiance of codes at gain 1, (n, 3)."""
         values = np.stack([np.interp(codes[:, c], np.arange(256), self._table[:, c]) for c in range(3)], -1)
         return np.asarray(np.log(values / gain + DARK))
 
 
 def _samples_in_disc() -> Array:
-    """Four places of each cell of a square that lies in the disc, (4, cells, 2) in radii: half a cell of blur."""
+    """Return four sample positions in each cell inside the disc, (4, cells, 2) in radii.
+
+    They average over half a cell.
+    """
     middle = 2.0 * (np.arange(CELLS) + 0.5) / CELLS - 1.0
     row, column = np.nonzero(np.hypot(middle, middle[:, None]) < 0.9)
     around = np.array([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]]) / CELLS
@@ -210,19 +214,19 @@ _SAMPLES = _samples_in_disc()
 
 
 def _has_changed(change: Array) -> bool:
-    """Return whether enough cells of a ball's disc changed, (cells, 3); cells hidden in either frame did not."""
+    """Return True if enough cells of a ball's disc changed, (cells, 3); cells hidden in either frame do not count."""
     return bool((np.abs(change) > CHANGED).any(axis=1).mean() >= DISC_SHARE)
 
 
 def _follow(before: Array, now: Array, seconds: float) -> Array:
-    """Return the memory ``before``, moved toward the seen cells of ``now`` by the time constant ``MEMORY``."""
+    """Return the memory ``before``, moved toward the visible cells of ``now`` with the time constant ``MEMORY``."""
     followed = before + (1.0 - np.exp(-abs(seconds) / MEMORY)) * (now - before)
     followed = np.where(np.isnan(before), now, followed)
     return np.asarray(np.where(np.isnan(followed), before, followed))
 
 
 def _points_around(scene: Scene) -> Array:
-    """Points of planes around balls, none under a box, (n, 3)."""
+    """Return points of planes around balls, without those under a box, (n, 3)."""
     turn = np.arange(24) * np.pi / 12
     circle = np.stack([np.cos(turn), np.sin(turn)], -1)
     found = [np.zeros((0, 3))]

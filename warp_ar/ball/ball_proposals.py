@@ -1,11 +1,10 @@
-"""Circles that a picture may show: where edges of all directions point to one place.
+"""Candidate circles in a picture: places toward which edges of all directions point.
 
-Every edge votes for the two places at a radius from it along its gradient (the fast radial symmetry of [LZ03]). Votes
-are counted by eighths of the turn, and none of them counts for more than a rim in it can give: a straight edge or a
-thicket fills one or two eighths, a rim most of them. Radii are looked for an octave at a time, each in a picture that
-is reduced until they are some 20 pixels, so that a ball of a thirtieth of the picture is seen as well as one that fills
-it. Gradients are those of the logarithm of the codes: in the short exposures of a bracket a rim is a few codes high,
-beside lamps of two hundred.
+Every edge votes for the two places at distance r along its gradient (fast radial symmetry [LZ03]). Votes are counted in
+eighths of the full angle, each limited to the share that a rim can give: a straight edge or a thicket fills one or two
+eighths, a rim most of them. Each octave of radii is searched in a picture reduced so that they are about 20 pixels; a
+ball of a thirtieth of the picture is found as well as one that fills it. Gradients are those of the logarithm of the
+codes: in the short exposures of a bracket, a rim has a contrast of a few codes, next to lamps of two hundred.
 
 References:
     [LZ03] G. Loy and A. Zelinsky. Fast radial symmetry for detecting points of interest. PAMI 25(8), 2003.
@@ -24,32 +23,34 @@ Array = NDArray[np.float64]
 Circle = tuple[float, float, float]
 
 SMALLEST, LARGEST = 1.0 / 45.0, 0.62
-"""Radii over the picture's shorter side that are looked for; a ball may leave the picture by half its radius."""
+"""Smallest and largest radius, relative to the picture's shorter side; a ball may leave the picture by half its
+radius."""
 LEAST_RADIUS = 5.0
-"""Pixels of the smallest ball."""
+"""Smallest radius of a ball in pixels."""
 REDUCED = 14.0
-"""Pixels of an octave's smallest radius in the picture in which it is looked for."""
+"""Radius in pixels of an octave's smallest circle in its reduced picture."""
 STEPS = (1.0, 1.19, 1.41, 1.68)
-"""Radii of an octave over its smallest."""
+"""Radii of an octave, relative to its smallest."""
 SLACK = 0.1
-"""Standard deviation of a vote's place over the radius: the steps between radii, a lens's ellipse, noise."""
+"""Standard deviation of a vote's position relative to the radius, for the steps of radii, a lens's ellipse, and
+noise."""
 SECTORS = 8
-"""Parts of the turn that count on their own."""
+"""Number of sectors that are counted separately."""
 FAINT = 0.012
-"""Derivative of the logarithm of codes, per pixel, below which nothing is an edge."""
+"""Smallest gradient of an edge, as the derivative of the logarithm of codes per pixel."""
 DARK = 5.0
-"""Codes that are added before the logarithm: noise of the darks."""
+"""Code added before the logarithm, to suppress noise in dark regions."""
 LEAST_VOTE = 0.08
-"""Share of a whole rim below which no circle is proposed."""
+"""Smallest share of a whole rim for which a circle is proposed."""
 APART = 0.2
-"""Difference over the radius from which on two circles are two."""
+"""Difference, relative to the radius, from which two circles are distinct."""
 
 
 def _edges(image: Image) -> tuple[Array, Array]:
-    """Places (n, 2) of edges, one pixel wide, and unit gradients there (n, 2)."""
+    """Return positions (n, 2) of edges, one pixel wide, and unit gradients there (n, 2)."""
     light = cv2.GaussianBlur(np.log(image.astype(np.float32) + DARK), (0, 0), 0.7)
     gx, gy = (cv2.Sobel(light, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1)))
-    # The channel that changes most: a coloured ball may be as bright as what is behind it.
+    # The channel with the largest gradient: a coloured ball may have the brightness of its background.
     most = np.argmax(gx**2 + gy**2, axis=-1)[..., None]
     gx, gy = (np.take_along_axis(g, most, -1)[..., 0] for g in (gx, gy))
     size = np.hypot(gx, gy)
@@ -60,9 +61,9 @@ def _edges(image: Image) -> tuple[Array, Array]:
 
 
 def _vote(places: Array, ways: Array, radius: float, size: tuple[int, int]) -> tuple[Array, float, float]:
-    """Share of a rim of ``radius`` that edges show about each place: a grid, its cell in pixels, and its margin.
+    """Return the share of a rim of ``radius`` around each position: a grid, its cell size in pixels, and its margin.
 
-    ``size``: height and width of the picture. Of an eighth of the turn at most all of its rim is counted.
+    ``size`` is the picture's (height, width). Votes of each eighth are limited to that eighth of a rim.
     """
     spread, margin = SLACK * radius, 0.5 * radius
     cell = max(1.0, spread / 1.5)
@@ -84,11 +85,11 @@ def _vote(places: Array, ways: Array, radius: float, size: tuple[int, int]) -> t
 
 
 def propose_circles(image: Image, most: int = 5) -> list[Circle]:
-    """Circles (x, y, radius) in pixels that a picture may show, of each octave of radii the ``most`` likely.
+    """Return candidate circles (x, y, radius) in pixels; for each octave of radii, the ``most`` likely.
 
     Args:
         image: uint8 RGB (height, width, 3).
-        most: Circles of each octave.
+        most: Number of circles per octave.
     """
     height, width = image.shape[:2]
     side = min(height, width)
@@ -111,7 +112,7 @@ def propose_circles(image: Image, most: int = 5) -> list[Circle]:
 
 
 def _distinct(found: list[tuple[float, Circle]], most: int) -> list[Circle]:
-    """The likeliest circles, none of them another one once more."""
+    """Return the likeliest circles, without near duplicates."""
     chosen: list[Circle] = []
     for _, (x, y, radius) in sorted(found, reverse=True):
         if all(max(math.hypot(x - a, y - b), abs(radius - r)) > APART * max(radius, r) for a, b, r in chosen):

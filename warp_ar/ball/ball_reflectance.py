@@ -1,15 +1,15 @@
 """Reflectance of a mirror ball, from surfaces that the frame shows both directly and mirrored in the ball.
 
-A matt surface has one radiance wherever it is seen from. So where the ball mirrors a point of a modelled plane that the
-camera sees beside the ball as well, the ball's pixel over that point's own is the ball's reflectance:
+A matt surface has the same radiance from all directions. Where the ball mirrors a point of a modelled plane that the
+camera also sees directly, the ratio of both pixels is the ball's reflectance:
 
     reflectance = median over pixels of L(pixel of the ball) / L(projection of the mirrored point).
 
-Neither card nor light must be known, and shadows do no harm: they lie on the point, whichever way it is looked at. What
-does is a response that is not the camera's (a ratio r becomes r^g with the wrong exponent g: 7 % at most for gammas of
-1.8 to 2.6 taken for sRGB), and a ball elsewhere than the scene has it: the two pictures then differ in their course,
-which their correlation tells. A surface that shines has another radiance from either side, and another difference at
-each place: one half of the ball then says something else than the other.
+Neither card nor light must be known, and shadows do not matter, because they lie on the point in both views. Two errors
+remain. A wrong response curve turns a ratio r into r^g with an exponent g: at most 7 % for gammas of 1.8 to 2.6 taken
+for sRGB. A wrong position of the ball makes the two pictures differ, which lowers their correlation. A glossy surface
+has different radiance in the two directions, and the difference varies over the ball: one half of the ball then gives
+another reflectance than the other.
 """
 
 from __future__ import annotations
@@ -30,62 +30,60 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 FACING: Final = 0.35
-"""Least cosine at which the ball is met: nearer to its rim a pixel mirrors a wide patch."""
+"""Smallest cosine of incidence on the ball; closer to its rim, a pixel mirrors a wide area."""
 GRAZING: Final = 0.25
-"""Least cosine at which a plane is looked at, by the camera and by way of the ball: beyond it even paper shines."""
+"""Smallest cosine at which a plane is seen, directly and by way of the ball; at grazing angles even paper is glossy."""
 BESIDE: Final = 1.15
-"""Radii from the ball's middle in the picture from which on a point is not the ball's own."""
+"""Distance in the picture from the ball's centre, in radii, from which a point is not hidden by the ball."""
 CODES: Final = (12, 200)
-"""Codes that are neither quantised nor near a shoulder."""
+"""Range of codes that are neither quantised nor near clipping."""
 BLUR: Final = 1.5
-"""Pixels of blur of what is seen directly: its texture is mirrored smaller than it is seen."""
+"""Blur in pixels of the direct view, because the mirror image of its texture is smaller."""
 BLUR_REACH: Final = 6
-"""Pixels to each side that blur, four standard deviations."""
+"""Extent of the blur in pixels to each side: four standard deviations."""
 BLUR_SIZE: Final = 2 * BLUR_REACH + 1
 FEWEST: Final = 200
-"""Pixels that must tell."""
+"""Smallest number of usable pixels."""
 SCATTER: Final = 0.2
-"""Greatest standard deviation of one pixel's logarithm: with more, the two do not show the same."""
+"""Largest standard deviation of one pixel's logarithm; above it, the two views show different things."""
 ALIKE: Final = 0.6
-"""Least correlation of both pictures' logarithms."""
+"""Smallest correlation of the logarithms of both views."""
 HALVES: Final = 0.15
-"""Greatest difference of a logarithm between halves of the pixels: 0.11 at most on matt tables and the clips, 0.26 and
-more on three of four polished tables.
-"""
+"""Largest difference of logarithms between halves of the pixels: at most 0.11 on matt tables and the clips, 0.26 and
+more on three of four polished tables."""
 LEAST_DEVIATION: Final = 0.025
-"""Logarithm by which all of a ball is off together: its place and radius are."""
+"""Systematic error of the logarithm, from the ball's position and radius."""
 REFLECTANCE: Final = 0.12
-"""Logarithm by which a ball may reflect more or less than the scene says: another response than the camera's, or a
-radius that is 5 % off, moves what is measured by up to 0.09.
-"""
+"""Largest logarithm of the ratio to the scene's reflectance that is within error: another response curve, or a radius
+error of 5 %, changes the measurement by up to 0.09."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reflected:
-    """Statement of one picture about a ball."""
+    """Reflectance of a ball measured in one picture."""
 
     reflectance: tuple[float, float, float]
     """RGB."""
     pixels: int
-    """Pixels that say so."""
+    """Number of pixels used."""
     deviation: float = 0.0
-    """Standard deviation of the logarithm, by how far halves of the ball differ."""
+    """Standard deviation of the logarithm, by the difference between halves of the ball."""
 
 
 def measure_reflectance(
     scene: Scene, camera: Camera, probe: Probe, view: tuple[Image, Pose], table: NDArray[np.float32]
 ) -> Reflected | None:
-    """The reflectance of a ball by one picture.
+    """Measure a ball's reflectance in one picture.
 
     Args:
-        scene: What stands around the ball.
-        camera: Of the picture's size.
-        probe: The ball, where it is seen.
+        scene: Scene around the ball.
+        camera: Camera at the picture's size.
+        probe: The ball at its place in the picture.
         view: RGB picture (h, w, 3) and ``camera_from_world``.
         table: Linear value of each code, (256, 3).
 
     Returns:
-        None where the ball mirrors too little of what the camera sees as well, or both do not show the same.
+        The reflectance; None if the ball mirrors too few directly visible points, or both views differ.
     """
     image, pose = view
     mirrored, points = _mirrored_points(scene, camera, probe, pose)
@@ -113,7 +111,7 @@ def measure_reflectance(
 
 
 def _blurred(image: Image, table: NDArray[np.float32], places: Array) -> Array:
-    """Blurred radiance at places of a picture, (n, 3); of the picture only what lies around them is blurred.
+    """Return blurred radiance at positions of a picture, (n, 3); only their surroundings are blurred.
 
     Args:
         image: RGB (h, w, 3).
@@ -129,7 +127,7 @@ def _blurred(image: Image, table: NDArray[np.float32], places: Array) -> Array:
 
 
 def difference_of_halves(ratio: Array, pixels: NDArray[np.int64]) -> float:
-    """Return how far one half of the ball says something else than the other, in the channel in which it does most.
+    """Return the largest difference, over channels, between the medians of one half of the ball and the other.
 
     Args:
         ratio: Logarithms, (n, 3).
@@ -145,7 +143,7 @@ def difference_of_halves(ratio: Array, pixels: NDArray[np.int64]) -> float:
 
 
 def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> tuple[NDArray[np.int64], Array]:
-    """Pixels of the ball (n, 2) and the points of matt planes that they mirror and the camera sees, (n, 3)."""
+    """Return pixels of the ball, (n, 2), and the directly visible matt points that they mirror, (n, 3)."""
     center, radius = np.array(probe.center, float), probe.radius
     eye = -pose.rotation.T @ pose.translation
     nothing = np.zeros((0, 2), np.int64), np.zeros((0, 3))
@@ -176,10 +174,10 @@ def _mirrored_points(scene: Scene, camera: Camera, probe: Probe, pose: Pose) -> 
 
 
 def are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Array) -> NDArray[np.bool_]:
-    """Return whether the camera sees points of planes beside the ball, (n,)."""
+    """Return a mask of plane points that the camera sees directly next to the ball, (n,)."""
     eye = -pose.rotation.T @ pose.translation
     at = project(camera, pose.apply(points))
-    seen = (at > 1.0).all(axis=1) & (at < (camera.width - 2, camera.height - 2)).all(axis=1)  # NaN is not
+    seen = (at > 1.0).all(axis=1) & (at < (camera.width - 2, camera.height - 2)).all(axis=1)  # NaN compares false
     ray = points - eye
     away, direction = np.sqrt(dot(ray, ray)), _unit(ray)
     distance, is_matt = _nearest(scene.proxies, np.broadcast_to(eye, points.shape), direction)
@@ -193,9 +191,9 @@ def are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Arr
 
 
 def _nearest(proxies: tuple[Proxy, ...], origin: Array, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the distance to what rays meet first, and if that is a matt plane not met at a grazing angle, (n,).
+    """Return the distance to the first hit of each ray, and a mask of hits on matt planes that are not grazing, (n,).
 
-    Meshes are left out: what they hide scatters.
+    Meshes are ignored: rays that they would block only add scatter.
     """
     known = [proxy for proxy in proxies if proxy.shape != "mesh" and proxy.marker is None]
     shapes = shapes_of(known)

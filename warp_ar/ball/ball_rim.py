@@ -1,19 +1,20 @@
-"""Evidence of a picture for a mirror ball's rim: how well each piece of an outline explains what is seen across it.
+"""Evidence for a mirror ball's rim in a picture: how well each piece of an outline explains the profile across it.
 
-At its rim a mirror shows what lies behind it, so the step across the outline is often weak, and the reflections that
-crowd inside it are stronger. They crowd by a known law. With t pixels outward from the rim of a ball of r pixels, the
-ray that is mirrored at t < 0 is deflected by
+At its rim a mirror reflects the surface behind it, so the step across the outline is often weaker than the reflections
+inside it. These are compressed toward the rim in a known way. At t pixels outward from the rim of a ball with a radius
+of r pixels, the ray mirrored at t < 0 is deflected by
 
     q(t) = 2 acos(1 + t / r),
 
-which rises like a square root: whatever lies behind, it is blurred away within the first pixel or two, and from there
-on changes slowly in q. So a profile across the rim is modelled, before the picture's own blur, as
+which grows like a square root. Any background is compressed beyond resolution within the first pixel or two, and
+further inside changes slowly in q. A profile across the rim is therefore modelled, before the picture's own blur, as
 
     I(t) = a0 + a1 t  outside,    b0 + b1 q(t) + b2 q(t)^2  inside,
 
-linear in its five coefficients. For each shift s of the rim along the normal they are solved for, and what remains,
-C(s), makes the profile's cost (n / 2) log(C(s) + floor): a likelihood whose noise is not known. Where nothing is seen
-it is flat; where a stand or a reflection makes a stronger step it is bounded by ``MOST_COST``, so that it is outvoted.
+which is linear in its five coefficients. For each shift s of the rim along the normal they are solved for. The residual
+C(s) gives the profile's cost (n / 2) log(C(s) + floor): a likelihood with unknown noise. The cost is flat where no rim
+is visible. Where a stand or a reflection makes a stronger step, the cost is bounded by ``MOST_COST``, so that other
+pieces outvote it.
 """
 
 from __future__ import annotations
@@ -32,25 +33,25 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 STEP = 0.5
-"""Pixels between samples of a profile: finer ones say nothing new."""
+"""Distance in pixels between samples of a profile; finer sampling adds no information."""
 SHIFT_STEP = 0.1
-"""Pixels between shifts that are tried; costs between them are interpolated."""
+"""Distance in pixels between evaluated shifts; costs in between are interpolated."""
 MOST_COST = 4.5
-"""Bound on a profile's cost above its best: 4.5, three standard deviations."""
+"""Bound of a profile's cost above its minimum: 4.5 is three standard deviations."""
 STEP_WINDOW = (3.0, 5.0)
-"""Pixels inside and outside the rim in which a step is looked for."""
+"""Range in pixels inside and outside the rim in which steps are searched."""
 FINE_WINDOW = (2.0, 3.0)
-"""The same where it is measured: other reflections follow soon."""
+"""Range in pixels inside and outside the rim for measurement; other reflections are close."""
 INNER_BAND, OUTER_BAND = (-0.16, -0.02), (0.03, 0.18)
-"""Shares of the radius inside and outside a rim whose gradients are compared."""
+"""Bands inside and outside a rim, relative to the radius, whose gradients are compared."""
 FLAT = 1e-6
-"""Squared gradient, per pixel of codes from 0 to 1, below which a picture is flat."""
+"""Squared gradient, per pixel of codes from 0 to 1, below which a picture is uniform."""
 NOISE = 1.5 / 255.0
-"""Standard deviation, as a share of the codes' range, that even a clean profile is expected to have."""
+"""Smallest assumed standard deviation of a profile, relative to the range of codes."""
 
 
 def _bases(t: Array, shifts: Array, radius: float, blur: float) -> Array:
-    """The model's columns (k, n, 5) at samples ``t`` (n,) for each shift of the rim (k,)."""
+    """Return the model's columns (k, n, 5) at samples ``t`` (n,) for each shift of the rim (k,)."""
     fine = 0.05
     edge = np.abs(t).max() + np.abs(shifts).max() + 4 * blur + 1
     u = np.arange(-edge, edge, fine)
@@ -63,7 +64,7 @@ def _bases(t: Array, shifts: Array, radius: float, blur: float) -> Array:
 
 
 def _left(basis: Array) -> Array:
-    """Projection (n, n) onto what columns (n, k) cannot explain, with a ridge far below the codes' noise."""
+    """Return the projection (n, n) onto the residuals of columns (n, k), slightly regularised."""
     basis = basis / (np.linalg.norm(basis, axis=0) + 1e-9)
     gram = basis.T @ basis + 1e-6 * np.eye(basis.shape[1])
     return np.asarray(np.eye(len(basis)) - basis @ np.linalg.solve(gram, basis.T))
@@ -71,7 +72,7 @@ def _left(basis: Array) -> Array:
 
 @functools.lru_cache(maxsize=64)
 def _projections(inward: float, outward: float, shift: float, radius: float, blur: float) -> tuple[Array, Array]:
-    """Shifts (k,), and for each the matrix (n, n) that leaves of a profile what the model cannot explain."""
+    """Return shifts (k,) and the matrix (n, n) of each that maps a profile to its residual under the model."""
     t = np.arange(-inward, outward + 0.5 * STEP, STEP)
     shifts = np.arange(-shift, shift + 0.5 * SHIFT_STEP, SHIFT_STEP)
     return shifts, np.stack([_left(basis) for basis in _bases(t, shifts, radius, blur)])
@@ -79,30 +80,33 @@ def _projections(inward: float, outward: float, shift: float, radius: float, blu
 
 @functools.lru_cache(maxsize=64)
 def _window(radius: float, blur: float) -> tuple[Array, Array]:
-    """Return what the model, and what a parabola, cannot explain of a window about the rim: two matrices (n, n)."""
+    """Return matrices (n, n) from a window around the rim to its residuals under the model and a parabola."""
     t = np.arange(-STEP_WINDOW[0], STEP_WINDOW[1] + 0.5 * STEP, STEP)
     return _left(_bases(t, np.zeros(1), radius, blur)[0]), _left(np.stack([np.ones_like(t), t, t * t], 1))
 
 
 @dataclasses.dataclass(frozen=True)
 class RimEvidence:
-    """Cost of every piece of an outline against its shift along the outward normal."""
+    """Cost of each piece of an outline as a function of its shift along the outward normal."""
 
     shifts: Array
-    """Pixels, (k,), evenly spaced about zero."""
+    """Shifts in pixels, (k,), evenly spaced about zero."""
     costs: Array
-    """(n, k): above each piece's best, at most ``MOST_COST``; zero where the picture does not show the piece."""
+    """Costs, (n, k), above each piece's minimum and at most ``MOST_COST``; zero for pieces outside the picture."""
     known: NDArray[np.bool_]
-    """Pieces (n,) that the picture shows."""
+    """Mask of pieces (n,) inside the picture."""
     least: float = 0.0
-    """Mean of the pieces' best costs, by which blurs are compared."""
+    """Mean of the pieces' minimal costs, for comparing blurs."""
 
     def totals(self, shifts: Array) -> Array:
-        """Mean costs (m,) of the pieces shifted by ``shifts`` (m, n) pixels; outside the window a piece costs most."""
+        """Return mean costs (m,) of the pieces shifted by ``shifts`` (m, n) pixels.
+
+        Outside the window the cost is maximal.
+        """
         return self._each(shifts).mean(1) if self.known.any() else np.full(len(shifts), MOST_COST)
 
     def _each(self, shifts: Array) -> Array:
-        """Costs of the pieces that are known, (m, known)."""
+        """Return the costs of the pieces inside the picture, (m, known)."""
         last = len(self.shifts) - 1
         at = (shifts[:, self.known] - self.shifts[0]) / (self.shifts[1] - self.shifts[0])
         low = np.clip(at.astype(int), 0, last - 1)
@@ -113,11 +117,11 @@ class RimEvidence:
         return np.where((at < 0) | (at > last), MOST_COST, cost)
 
     def support(self, shift: Array) -> float:
-        """Share of the pieces in view that speak for the outline; of evidence from ``gather_steps``."""
+        """Return the share of pieces in view that support the outline; for evidence from ``gather_steps``."""
         return float((self._each(shift[None]) < 0.5 * MOST_COST).mean()) if self.known.any() else 0.0
 
     def without(self, gone: NDArray[np.bool_]) -> RimEvidence:
-        """The same but for some pieces."""
+        """Return the evidence without some pieces."""
         return dataclasses.replace(self, known=self.known & ~gone)
 
 
@@ -131,10 +135,10 @@ def _profiles(
     *,
     whole: bool = True,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Profiles across an outline, (m, channels, samples), of the pieces that the picture shows, and which (n,).
+    """Return profiles across an outline, (m, channels, samples), of the pieces inside the picture, and their mask (n,).
 
-    ``table`` (256,) gives the value of each code. ``whole``: pieces whose profile leaves the picture are not shown;
-    else it goes on as at the picture's edge, and only the piece itself must be inside.
+    ``table`` (256,) gives the value of each code. With ``whole``, a piece counts as inside only if its profile does.
+    Otherwise only the piece itself must be inside, and the picture's border is replicated.
     """
     height, width = image.shape[:2]
     t = np.arange(-inward, outward + 0.5 * STEP, STEP)
@@ -154,10 +158,10 @@ def _profiles(
 def gather_steps(
     image: Image, points: Array, normals: Array, radius: float, *, shift: float, blur: float = 0.8
 ) -> RimEvidence:
-    """Return where there are steps: how much better than a smooth curve the model explains a window about each shift.
+    """Return evidence for steps: how much better the model explains a window around each shift than a smooth curve.
 
-    A piece of the outline costs ``MOST_COST`` where nothing speaks for a step, and nothing where one is certain,
-    however strong it is: a circle is where most pieces have one.
+    A piece of the outline has the cost ``MOST_COST`` without a step and 0 with a certain step, independent of its
+    contrast: the rim is the circle on which most pieces have one.
     """
     inward, outward = STEP_WINDOW
     profiles, known = _profiles(image, _CODES, points, normals, inward + shift, outward + shift, whole=False)
@@ -183,18 +187,18 @@ def gather_steps(
 def gather_evidence(
     image: Image, points: Array, normals: Array, radius: float, *, shift: float, blur: float
 ) -> RimEvidence:
-    """Cost of each piece of an outline that is right within ``shift`` pixels: minus a log likelihood.
+    """Return the cost, a negative log likelihood, of each piece of an outline that is accurate to ``shift`` pixels.
 
     Args:
         image: uint8 RGB (height, width, 3).
         points: Outline (n, 2), pixels.
         normals: Outward unit normals (n, 2).
-        radius: Of the ball in pixels.
-        shift: Pixels by which the outline may be off.
+        radius: Radius of the ball in pixels.
+        shift: Largest error of the outline in pixels.
         blur: Standard deviation of the picture's blur in pixels.
     """
     inward, outward = FINE_WINDOW[0] + shift, FINE_WINDOW[1] + shift
-    # Blur is linear in light, and chroma is blurred by codecs.
+    # Blur is linear in radiance, and codecs blur chroma.
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     profiles, known = _profiles(gray[..., None], _LIGHT, points, normals, inward, outward)
     shifts, left = _projections(inward, outward, round(shift, 1), float(f"{radius:.2g}"), round(blur, 2))
@@ -204,7 +208,7 @@ def gather_evidence(
     light = profiles[:, 0] / (profiles[:, 0].mean(1, keepdims=True) + 0.03)
     size = left.shape[1]
     rest = np.stack([((light @ matrix) ** 2).sum(1) for matrix in left], 1)
-    # Neighbouring samples share pixels: a profile counts for as many as it is pixels long.
+    # Neighbouring samples share pixels: a profile counts as one sample per pixel of its length.
     told = 0.5 * size * STEP * np.log(rest / size + NOISE**2)
     best = told.min(1, keepdims=True)
     costs[known] = np.minimum(told - best, MOST_COST)
@@ -216,26 +220,26 @@ _LIGHT = decode_table("srgb")[:, 1].astype(np.float32)
 
 
 def gradients(image: Image) -> NDArray[np.float32]:
-    """Derivatives of a picture's brightness (codes as 0 to 1) along x and y, (height, width, 2)."""
+    """Return derivatives of a picture's brightness (codes from 0 to 1) along x and y, (height, width, 2)."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
     return np.dstack([cv2.Sobel(gray, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1))])
 
 
 def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Array, radii: Array) -> Array:
-    """Return how much more radial gradients are just inside outlines than just outside.
+    """Return how much stronger radial gradients are just inside outlines than just outside.
 
-    A ball squeezes what it mirrors toward its rim along the radius, not along the rim: there q'(t) grows beyond bounds.
-    So inside the rim gradients point along the radius, and outside it they know nothing of the ball. An edge that is
-    mirrored concentrically, such as a table's, has radial gradients on both sides, and is no rim.
+    A ball compresses its reflections along the radius, not along the rim, because q'(t) is unbounded there. Gradients
+    inside the rim are therefore radial, and gradients outside are independent of the ball. A concentrically mirrored
+    edge, such as a table's, has radial gradients on both sides.
 
     Args:
-        slopes: Of ``gradients``.
+        slopes: Result of ``gradients``.
         points: Outlines (m, n, 2), pixels.
         normals: Outward unit normals (m, n, 2).
-        radii: Of the balls in pixels, (m,).
+        radii: Radii of the balls in pixels, (m,).
 
     Returns:
-        Mean logarithm of radial over tangential energy inside, less that outside, (m,): 2 to 3 at a rim, below 0
+        Mean logarithm of radial over tangential energy inside, minus the same outside, (m,): 2 to 3 at a rim, below 0
         inside it.
     """
     bands = np.concatenate([np.linspace(low, high, 6) for low, high in (INNER_BAND, OUTER_BAND)])
@@ -258,17 +262,17 @@ def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Arra
 
 
 def descend(costs: Callable[[Array], Array], start: Array, step: float, least: float) -> tuple[Array, float]:
-    """Minimum of a function of few unknowns by a pattern search: it needs no derivatives of interpolated costs.
+    """Minimise a function of few unknowns by pattern search, which needs no derivatives of interpolated costs.
 
     Args:
-        costs: Takes places (m, n), returns costs (m,).
-        start: Where to begin, (n,).
-        step: The first step.
-        least: The last one.
+        costs: Function from positions (m, n) to costs (m,).
+        start: Initial position, (n,).
+        step: First step length.
+        least: Last step length.
     """
     best, value = start.copy(), float(costs(start[None])[0])
     size = len(start)
-    # Along each axis, and along the diagonals of all: a circle's place and radius trade off against each other.
+    # Steps along each axis and along the diagonals of all: a circle's position and radius are correlated.
     axes = [sign * axis for axis in np.eye(size) for sign in (1.0, -1.0)]
     moves = np.array([*axes, *np.stack(np.meshgrid(*[(-1.0, 1.0)] * size), -1).reshape(-1, size)])
     while step >= least:

@@ -1,21 +1,20 @@
-"""A mirror ball's centre and radius together, from its outlines in frames with known poses.
+"""Centre and radius of a mirror ball from its outlines in frames with known poses.
 
-An outline tells three things: where the ball's centre is seen, and how large the ball looks. Frames from one side leave
-a small near ball and a large far one alike; frames from several sides, or a ball known to stand on the table, do not.
-The unknowns (c, r) minimise
+An outline gives the direction of the ball's centre and the ball's apparent size. From one side, a small near ball and a
+large distant one look the same; frames from several sides, or a ball known to stand on the table, resolve this. The
+unknowns (c, r) minimise
 
     sum_i |(m(R_i c + t_i, r) - m_i) / sigma_i|^2 + ((c_z - r - ground) / sigma_ground)^2,
     m(q, r) = (f x/z, f y/z, f r/|q|),
 
-by Gauss-Newton with Huber's weights. What spoils a rim (a band of light inside it, what is behind it) spoils it in
-every frame alike, so that frames do not average out: the interval is that of one typical frame, not of their mean.
+by Gauss-Newton with Huber's weights. Disturbances of a rim (a band of light inside it, the background) are the same in
+every frame, so their errors do not average out: the interval is that of one typical frame, not of the mean.
 
-In about one frame of twenty the finder takes an edge beside the rim for the rim: the table's edge that is mirrored
-along it, the edge of something behind the ball. Its interval tells of the edge that was taken, not that it is another
-one's, so that with two frames from different sides neither's interval holds. Frames that contradict each other tell
-that one is wrong, but not which one. So each outline in turn says where the ball is in the other frames, the outlines
-there are looked for again near those places, and the ball stays that shows the most rim over all frames. By two
-frames of a path-traced studio the centre is then off by 0.2 mm instead of 8.
+In about one frame of twenty, the finder takes a nearby edge for the rim, such as the table's edge mirrored along it or
+an edge behind the ball. The interval of that outline is then wrong, and with two frames from different sides it is
+unknown which of the contradicting outlines is wrong. Therefore each outline in turn predicts the ball in the other
+frames, where outlines are searched again near the prediction. The ball with the most visible rim over all frames is
+kept. With two frames of a path-traced studio, this reduces the error of the centre from 8 mm to 0.2 mm.
 """
 
 from __future__ import annotations
@@ -36,29 +35,29 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 View = tuple[Image, Pose]
 Found = tuple[BallOutline, Pose]
-"""An outline with the pose of its frame."""
+"""Outline with the pose of its frame."""
 
 STANDS = 0.0005
-"""Metres: standard deviation of the height of a ball that stands on a table: the card's thickness, its unevenness."""
+"""Standard deviation in metres of the height of a ball that stands on a table: the card's thickness, unevenness."""
 LEAST_PIXELS = 0.25
-"""Pixels: no outline is better than this in any of its three numbers."""
+"""Smallest standard deviation in pixels of an outline's position and radius."""
 HUBER = 2.0
-"""Standard deviations beyond which an outline has less say."""
+"""Residual in standard deviations beyond which an outline has less weight."""
 STEPS = 30
-"""Most Gauss-Newton steps."""
+"""Largest number of Gauss-Newton steps."""
 APART = 4.0
-"""Standard deviations of an outline beyond which the others contradict it: right ones are off by 3.2 at most."""
+"""Distance in standard deviations beyond which an outline contradicts the others; right ones are within 3.2."""
 AGAIN = 0.12
-"""Share of the radius around an outline that others tell in which it is looked for again."""
+"""Relative search range around an outline predicted by other frames, as a share of the radius."""
 SAME = 0.05
-"""Share of the radius within which two balls are one."""
+"""Relative difference, as a share of the radius, within which two balls are the same."""
 MOST = 2
-"""Balls that are tried: each costs a third of a second and frame."""
+"""Number of balls that are tried; each takes a third of a second per frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BallSolution:
-    """A mirror ball as its outlines show it."""
+    """Mirror ball determined by its outlines."""
 
     center: tuple[float, float, float]
     """Centre in the marker's frame, metres."""
@@ -67,15 +66,15 @@ class BallSolution:
     center_deviation: tuple[float, float, float]
     """Standard deviations of the centre, metres."""
     radius_deviation: float
-    """Standard deviation of the radius, metres; 0 where it was assumed."""
+    """Standard deviation of the radius, metres; 0 if it was assumed."""
     radius_assumed: bool
-    """True if the radius is the one that was given: the frames are too alike to tell it."""
+    """True if the given radius was kept, because the frames are too similar to determine it."""
     outlines: tuple[BallOutline, ...]
-    """The outlines that it rests on."""
+    """Outlines that were used."""
 
 
 def ground_below(probe: Probe, proxies: Sequence[Proxy]) -> float | None:
-    """Height in metres of the level plane that a ball is over; None where the scene has none."""
+    """Return the height in metres of the horizontal plane below a ball; None if the scene has none."""
     x, y, _ = probe.center
     levels = []
     for proxy in proxies:
@@ -87,7 +86,7 @@ def ground_below(probe: Probe, proxies: Sequence[Proxy]) -> float | None:
 
 
 def rough_circle(camera: Camera, pose: Pose, probe: Probe) -> tuple[float, float, float] | None:
-    """Column, row and radius in pixels of where a scene has its ball; None where that is not before the camera."""
+    """Return column, row and radius in pixels of a scene's ball; None if it is not in front of the camera."""
     c = pose.apply(np.array(probe.center))
     if c[2] <= 1.2 * probe.radius:
         return None
@@ -99,22 +98,25 @@ def rough_circle(camera: Camera, pose: Pose, probe: Probe) -> tuple[float, float
 
 
 def standing_ground(probe: Probe, proxies: Sequence[Proxy]) -> float | None:
-    """Return the height in metres of what the ball stands on; None where the scene has it above nothing or afloat."""
+    """Return the height in metres of the surface on which the ball stands.
+
+    Return None if the scene's ball floats or has none.
+    """
     ground = ground_below(probe, proxies)
     return ground if ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius else None
 
 
 def find_outline(view: View, camera: Camera, probe: Probe, rough_error: float = ROUGH_ERROR) -> BallOutline | None:
-    """The ball's outline in a frame that shows it near where the scene has it.
+    """Return the ball's outline in a frame, searched near the scene's position.
 
     Args:
         view: RGB frame with ``camera_from_world``.
-        camera: It took the frame.
-        probe: The ball as the scene has it, metres.
-        rough_error: Share of the radius by which that may be off.
+        camera: Camera of the frame.
+        probe: The scene's ball, metres.
+        rough_error: Error of the scene's ball, as a share of its radius.
 
     Returns:
-        None where none is found, or it is below 4 pixels.
+        The outline; None if none is found or the radius is below 4 pixels.
     """
     circle = rough_circle(camera, view[1], probe)
     if circle is not None and circle[2] >= 4.0:
@@ -124,13 +126,13 @@ def find_outline(view: View, camera: Camera, probe: Probe, rough_error: float = 
 
 
 def _measure(camera: Camera, sphere: Array) -> Array:
-    """Column and row of the centre from the principal point, and the radius, in pixels, of centre over radius."""
+    """Return column and row from the principal point, and radius, in pixels, of centre over radius."""
     f = 0.5 * (camera.fx + camera.fy)
     return np.array([f * sphere[0] / sphere[2], f * sphere[1] / sphere[2], f / np.linalg.norm(sphere)])
 
 
 def outline_misfit(found: Found, camera: Camera, solution: BallSolution) -> float:
-    """Standard deviations of an outline, of its worst number, by which it is not where a solution has it."""
+    """Return the largest deviation of an outline's three numbers from a solution, in standard deviations."""
     outline, pose = found
     sphere = pose.apply(np.array(solution.center)) / solution.radius
     off = _measure(camera, sphere) - _measure(camera, np.array(outline.sphere))
@@ -138,13 +140,13 @@ def outline_misfit(found: Found, camera: Camera, solution: BallSolution) -> floa
 
 
 def solve_ball(outlines: Sequence[Found], camera: Camera, probe: Probe, ground: float | None = None) -> BallSolution:
-    """Centre and radius from outlines.
+    """Solve for centre and radius from outlines.
 
     Args:
         outlines: Outlines with ``camera_from_world``.
         camera: The camera.
-        probe: What the scene says, to start from.
-        ground: Height in metres of what the ball stands on; None: it may stand anywhere.
+        probe: The scene's ball, as the initial value.
+        ground: Height in metres of the surface below the ball; None: unknown.
 
     Raises:
         UsageError: There is no outline.
@@ -183,7 +185,7 @@ def solve_ball(outlines: Sequence[Found], camera: Camera, probe: Probe, ground: 
 def _minimise(
     residuals: Callable[[Array], Array], start: Array, free: NDArray[np.int_], frames: int
 ) -> tuple[Array, Array]:
-    """Least squares in some of the unknowns; returns all of them, and the covariance of the free ones."""
+    """Return the least-squares solution in some of the unknowns, and the covariance of the free unknowns."""
     x = start.copy()
     normal = np.eye(len(free))
     for _ in range(STEPS):
@@ -196,7 +198,7 @@ def _minimise(
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(e), 1e-9))
         normal = jacobian.T @ (weight[:, None] * jacobian)
         move = -np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(free)), jacobian.T @ (weight * e))
-        # The ball stays before the camera and keeps a size while far from the solution.
+        # Far from the solution, the ball is kept in front of the camera and its radius positive.
         move *= min(1.0, 0.02 / max(float(np.abs(move).max()), 1e-12))
         x[free] += move
         x[3] = max(x[3], 1e-3)
@@ -204,24 +206,24 @@ def _minimise(
             break
     e = residuals(x)
     spread = max(1.0, float(np.median(np.abs(e))) / 0.6745) ** 2
-    # Not a pseudo-inverse, which would call certain what the frames do not tell at all.
+    # A pseudo-inverse would report unobservable unknowns as certain.
     certain = normal + 1e-12 * np.trace(normal) * np.eye(len(free))
     return x, np.asarray(np.linalg.inv(certain) * spread * frames, float)
 
 
 def agreeing_outlines(views: Sequence[View], camera: Camera, probe: Probe, ground: float | None = None) -> list[Found]:
-    """The ball's outlines in frames with known poses; those that contradict each other are looked for again.
+    """Return the ball's outlines in frames with known poses; contradicting outlines are searched again.
 
     Args:
         views: RGB frames with ``camera_from_world``.
         camera: The camera.
-        probe: What the scene says, to start from.
-        ground: Height in metres of what the ball stands on; None: it may stand anywhere.
+        probe: The scene's ball, as the initial value.
+        ground: Height in metres of the surface below the ball; None: unknown.
 
     Returns:
-        Outlines with their poses, of the frames that show the ball near where the scene has it.
+        Outlines with their poses, for frames that show the ball near the scene's position.
     """
-    # Frames in which something is found; whether it is the ball is what is asked.
+    # Frames with an outline, which may not be the ball's.
     shown = [(view, outline) for view in views if (outline := find_outline(view, camera, probe)) is not None]
     first = [(outline, pose) for (_, pose), outline in shown]
     if len(first) < 2 or not _contradicted(first, camera, solve_ball(first, camera, probe, ground)):
@@ -250,7 +252,7 @@ def agreeing_outlines(views: Sequence[View], camera: Camera, probe: Probe, groun
 
 
 def _contradicted(outlines: Sequence[Found], camera: Camera, solution: BallSolution) -> set[int]:
-    """Return which of several outlines a solution contradicts."""
+    """Return the indices of outlines that contradict a solution."""
     return {k for k, pair in enumerate(outlines) if outline_misfit(pair, camera, solution) > APART}
 
 

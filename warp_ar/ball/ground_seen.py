@@ -1,9 +1,9 @@
-"""True if a receiver is seen where a mirror ball should stand: cheap evidence that there is none.
+"""Test if the receiver is visible where a mirror ball should stand, as cheap evidence that there is no ball.
 
-What lies flat looks the same from every side once it is turned into the receiver's plane. A ball does not: where it
-hides the receiver, its mirror image is seen, at another height, and moves against the receiver with the eye. So the
-points of the receiver that the ball would hide are looked up in frames from different sides; where they correlate
-the receiver itself is seen, and no ball. Where it has no texture, or all frames are from one side, that says nothing.
+A flat surface looks the same from all sides after projection to its plane. A ball does not: its mirror image is at
+another height, and moves relative to the receiver with the viewpoint. The receiver points that the ball would hide are
+therefore looked up in frames from different sides. If their codes correlate, the receiver itself is visible. Without
+texture, or with all frames from one side, the test gives no result.
 """
 
 from __future__ import annotations
@@ -25,43 +25,44 @@ Image = NDArray[np.uint8]
 View = tuple[Image, Pose]
 
 ACROSS: Final = 41
-"""Points along each side of the part of the receiver that is looked up."""
+"""Points along each side of the tested part of the receiver."""
 APART: Final = math.radians(12.0)
-"""Angle between two eyes, seen from the ball, from which a mirror image has moved by a sixth of its radius."""
+"""Angle between two viewpoints, seen from the ball, at which a mirror image moves by a sixth of its radius."""
 PAIRS: Final = 6
-"""Pairs of frames that are compared, those furthest apart first."""
+"""Number of compared pairs of frames, beginning with those farthest apart."""
 LEAST_POINTS: Final = 200
-"""Points that the ball would hide from both eyes."""
+"""Smallest number of points that the ball would hide from both viewpoints."""
 TEXTURE: Final = 0.01
 """Least contrast (standard deviation over mean of codes) for a verdict; the card's thin rings have 0.02 to 0.03."""
 ALIKE: Final = 0.8
-"""Median correlation of the pairs from which the receiver is seen: bare cards have 0.91 to 0.97, balls -0.4 to 0."""
+"""Smallest median correlation of the pairs at which the receiver is visible: 0.91 to 0.97 for a bare card, -0.4 to 0
+for a ball."""
 
 
 def ground_is_seen(views: Sequence[View], camera: Camera, probe: Probe, ground: float) -> bool:
-    """Return whether frames show the receiver where a ball would hide it; False where they do not tell.
+    """Return True if frames show the receiver where a ball would hide it; False also if that is uncertain.
 
     Args:
         views: RGB uint8 frames with ``camera_from_world``.
         camera: The camera.
-        probe: The ball, where it should stand.
-        ground: Height in metres of the level plane that it stands on.
+        probe: The ball at its supposed position.
+        ground: Height in metres of the horizontal plane below it.
     """
     correlations = ground_correlations(views, camera, probe, ground)
     return bool(correlations) and float(np.median(correlations)) > ALIKE
 
 
 def ground_correlations(views: Sequence[View], camera: Camera, probe: Probe, ground: float) -> list[float]:
-    """Return how alike the receiver that a ball would hide is in frames from different sides.
+    """Return correlations, between frames from different sides, of the receiver that a ball would hide.
 
     Args:
         views: 8-bit RGB frames and ``camera_from_world`` of each.
-        camera: It took them.
-        probe: Where the ball is said to be, metres.
+        camera: Camera of the frames.
+        probe: The ball at its supposed position, metres.
         ground: Height of the receiver in metres.
 
     Returns:
-        A correlation, -1 to 1, for each pair of frames that tells; none where nothing does.
+        A correlation, -1 to 1, for each usable pair of frames; empty without one.
     """
     line = np.linspace(-1.2, 1.2, ACROSS) * probe.radius
     x, y = (value.ravel() for value in np.meshgrid(line, line))
@@ -82,7 +83,7 @@ def ground_correlations(views: Sequence[View], camera: Camera, probe: Probe, gro
 
 
 def _look_up(view: View, camera: Camera, points: Array, probe: Probe) -> tuple[Array, NDArray[np.bool_]]:
-    """Codes of points (n, 3) in a frame, (n,), and which of them are in it and behind the ball."""
+    """Return codes of points (n, 3) in a frame, (n,), and a mask of points in the frame and behind the ball."""
     image, pose = view
     eye = pose.inverse().translation
     away = points - eye

@@ -1,9 +1,9 @@
-"""Reflectances of mirror balls as frames tell them, in the place of what the scene says where that is wrong.
+"""Reflectances of mirror balls measured in the frames, used where the scene's values are wrong.
 
-A scene's reflectance is a guess where nobody has measured it: chrome has 0.55 to 0.65, a silvered ornament 0.85. All
-captured light is off by as much. What is seen twice tells (``ball_reflectance``), on 9 of 10 tables within 5 %. So the
-first frames that tell are asked. Where their median agrees with the scene within ``REFLECTANCE``, the scene's number is
-kept: a ball that somebody has measured is known better. Beyond, the frames' is taken.
+An unmeasured reflectance is a guess: chrome has 0.55 to 0.65, a silvered ornament 0.85. An error scales all captured
+light. The measurement by surfaces seen directly and in the ball (``ball_reflectance``) is within 5 % on 9 of 10 tables.
+It is made in the first usable frames. If their median agrees with the scene within ``REFLECTANCE``, the scene's value
+is kept, because a measured ball is more exact; otherwise the median is used.
 """
 
 from __future__ import annotations
@@ -18,51 +18,51 @@ from warp_ar.ball.ball_reflectance import REFLECTANCE, measure_reflectance
 from warp_ar.scene import Camera, Pose, Probe, Scene
 
 ENOUGH: Final = 8
-"""Frames that tell, after which no more are asked."""
+"""Number of successful measurements after which no more are made."""
 MOST: Final = 24
-"""Frames that are asked where few tell."""
+"""Largest number of frames in which a measurement is tried."""
 EVERY: Final = 5
 """Interval, in frames, between measurements after the first three."""
 FIRST: Final = 3
 """Number of first frames that are all measured, for photographs and short clips."""
 STEADY: Final = 0.03
-"""Change of the median's logarithm that replaces the value in use; each replacement changes all light."""
+"""Smallest change of the median's logarithm that replaces the value in use, because each change affects all light."""
 
 
 class ReflectanceWatch:
-    """Tells, frame after frame, what to take for the reflectance of each ball."""
+    """Estimator of each ball's reflectance over the frames."""
 
     def __init__(self, scene: Scene, camera: Camera, table: NDArray[np.float32]) -> None:
-        """Begin with what the scene says.
+        """Start with the scene's reflectances.
 
         Args:
-            scene: With a marker and a ball.
-            camera: Of the frames.
+            scene: Scene with a marker and a ball.
+            camera: Camera of the frames.
             table: Linear value of each code, (256, 3).
         """
         self.watches = (camera, scene.marker, scene.proxies, scene.probes)
-        """Things that frames are of: the same frames tell those that watch the same, the same."""
+        """Inputs that determine the result for given frames; equal values allow one instance to be shared."""
         self.values = tuple(probe.reflectance for probe in scene.probes)
-        """RGB of each ball."""
+        """Reflectance of each ball, RGB."""
         self._scene, self._camera, self._table = scene, camera, table
         self._told: list[list[tuple[float, float, float]]] = [[] for _ in scene.probes]
         self._seen = self._asked = 0
 
     @property
     def is_told(self) -> bool:
-        """Return whether frames have taken the place of what the scene says."""
+        """Return True if a measured reflectance replaces one of the scene."""
         return self.values != tuple(probe.reflectance for probe in self._scene.probes)
 
     def observe(self, image: NDArray[np.uint8], pose: Pose, probes: Sequence[Probe]) -> bool:
-        """Look at a frame.
+        """Measure in a frame.
 
         Args:
             image: uint8 RGB (height, width, 3).
             pose: ``camera_from_world``.
-            probes: The scene's, where they are now.
+            probes: The scene's balls at their present positions.
 
         Returns:
-            Whether ``values`` changed.
+            True if ``values`` changed.
         """
         self._seen += 1
         rests = self._seen > FIRST and self._seen % EVERY

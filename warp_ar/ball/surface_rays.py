@@ -1,4 +1,4 @@
-"""Planes and boxes that rays meet."""
+"""Intersection of rays with planes and boxes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from warp_ar.scene.geometry import rotation_matrix
 
 Array = NDArray[np.float64]
 Shape = tuple[Array, Array, Array]
-"""Middle, axes as columns, and half the sides; the third of a plane is 0."""
+"""Centre, axes as columns, and half sizes; the third half size of a plane is 0."""
 
 NEAR = 1e-6
-"""Metres from which on a ray may meet something."""
+"""Smallest distance of a hit along a ray, metres."""
 
 
 def shapes_of(proxies: Iterable[Proxy]) -> list[Shape]:
@@ -27,14 +27,14 @@ def shapes_of(proxies: Iterable[Proxy]) -> list[Shape]:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return products of vectors (n, 3), (n,): NumPy's sum over three takes five times as long."""
+    """Return the dot products of vectors (n, 3), (n,); NumPy's sum over three columns takes five times as long."""
     return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
 
 
 def nearest_shape(shapes: Iterable[Shape], origin: Array, direction: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distance to the nearest shape, (n,), infinite without one, and its number.
+    """Return the distance to the nearest shape, (n,), infinite without a hit, and its index.
 
-    Maxima over columns are written out: NumPy is several times slower along a short last axis.
+    Maxima over columns are unrolled: NumPy is several times slower along a short last axis.
     """
     nearest, which = np.full(len(direction), np.inf), np.full(len(direction), -1)
     for number, (at, rotation, half) in enumerate(shapes):

@@ -1,1 +1,1 @@
-"""Camera, lens, response and printed card."""
+"""Calibration of camera, lens and response curve, and the printed card."""

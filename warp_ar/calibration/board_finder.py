@@ -1,8 +1,8 @@
-"""Recognition of a ChArUco board when nobody names it: dictionary, columns and rows, its markers' share.
+"""Recognition of an unknown ChArUco board: its dictionary, columns, rows, and size of markers relative to squares.
 
-Markers of one dictionary are read; the numbers of a ChArUco board run along its rows, so that a number of columns says
-where on the board each marker is. The right one is the one under which a plane's homography explains where the markers
-are in the picture.
+All markers of one dictionary are detected. The ids of a ChArUco board increase along its rows, so a number of columns
+determines each marker's place on the board. The right number is the one for which a homography explains the markers'
+places in the picture.
 """
 
 from __future__ import annotations
@@ -22,31 +22,32 @@ from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary
 Image = NDArray[np.uint8]
 
 KNOWN: Final = (SHEET, Marker(dictionary="DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022)))
-"""Boards that this program has handed out: their lengths are known."""
+"""Boards distributed with this program, whose lengths are known."""
 DICTIONARIES: Final = (
     *("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL"),
     *("DICT_APRILTAG_36h11", "DICT_APRILTAG_25h9", "DICT_APRILTAG_16h5", "DICT_ARUCO_MIP_36h12"),
 )
-"""Dictionaries that are tried; OpenCV's smaller ones are the first entries of these."""
+"""Dictionaries that are tried; OpenCV's smaller dictionaries are their first entries."""
 _FEWEST: Final = 5
-"""Least number of markers that identify a layout."""
+"""Smallest number of markers that identify a layout."""
 _LAYOUTS: Final = range(3, 15)
-"""Columns that are tried."""
+"""Numbers of columns that are tried."""
 STRAIGHT: Final = 0.04
-"""Median distance, in markers' sides, between where a layout has the corners and where they are: a lens bends a board
-by less, a wrong layout is off by a multiple."""
+"""Largest median distance, in marker sides, between a layout's corners and the detected ones. Lens distortion stays
+below it; a wrong layout exceeds it several times."""
 BENT: Final = 0.3
-"""The same of a fisheye, where a right layout was off by up to 0.23, a wrong one by 0.7 or more."""
+"""Largest median distance for a fisheye: up to 0.23 for a right layout, 0.7 or more for a wrong one."""
 
 
 def find_markers(image: Image) -> tuple[str, list[Detection]]:
-    """The dictionary of most markers in a picture, and its markers.
+    """Return the dictionary with the most markers in a picture, and its markers.
 
     Args:
         image: uint8 RGB or grey.
 
     Returns:
-        The name of the smallest of OpenCV's dictionaries that has them, and the markers; an empty name without any.
+        The name of OpenCV's smallest dictionary that contains all of them, and the markers; an empty name if there are
+        none.
     """
     gray = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     best: tuple[str, list[Detection]] = ("", [])
@@ -59,21 +60,21 @@ def find_markers(image: Image) -> tuple[str, list[Detection]]:
 
 
 def smallest_dictionary(name: str, number: int) -> str:
-    """The smallest dictionary of the family of one that has a number."""
+    """Return the smallest dictionary, of the same family as ``name``, that contains a marker's number."""
     if (family := re.fullmatch(r"(DICT_\dX\d)_\d+", name)) is None:
         return name
     return f"{family[1]}_{next(size for size in (50, 100, 250, 1000) if number < size)}"
 
 
 def recognise_board(image: Image, most_off: float = STRAIGHT) -> Marker | None:
-    """The ChArUco board in a picture; None where there is none, or too little of it.
+    """Return the ChArUco board in a picture; None if too little of a board is visible.
 
-    The lengths of a board that is not among ``KNOWN`` are in squares of one metre: a camera's intrinsics do not depend
-    on them.
+    A board that is not among ``KNOWN`` gets squares of one metre, because a camera's intrinsics do not depend on their
+    length.
 
     Args:
         image: uint8 RGB or grey.
-        most_off: ``STRAIGHT``, or ``BENT`` of a fisheye.
+        most_off: ``STRAIGHT``, or ``BENT`` for a fisheye.
     """
     name, found = find_markers(image)
     if len(found) < _FEWEST or len({d.id for d in found}) < len(found):
@@ -97,7 +98,7 @@ def recognise_board(image: Image, most_off: float = STRAIGHT) -> Marker | None:
         return None
     rows = max(3, math.ceil(2 * (max(d.id for d in found) + 1) / columns))
     rows += columns * rows // 2 <= max(d.id for d in found)
-    rows += first and rows % 2  # an odd number of rows begins with a black square in both layouts
+    rows += first and rows % 2  # a board with an odd number of rows begins with a black square in both layouts
     name = smallest_dictionary(name, columns * rows // 2 - 1)
     if columns * rows // 2 > len(find_dictionary(name).bytesList):
         return None
@@ -107,14 +108,14 @@ def recognise_board(image: Image, most_off: float = STRAIGHT) -> Marker | None:
 def _explain(
     found: list[Detection], corners: NDArray[Any], columns: int, first: int, ratio: float | None
 ) -> tuple[float, float]:
-    """Median distance in pixels between corners and a layout's, and the markers' share of a square.
+    """Return the median distance in pixels of corners from a layout, and the ratio of marker to square side.
 
     Args:
         found: The markers.
         corners: Their corners in the picture, (n, 4, 2).
         columns: Squares along x.
         first: 1 if the board's first square is white, else 0.
-        ratio: The markers' share of a square; None: find it, in a way that needs no more than two homographies.
+        ratio: Ratio of marker to square side; None: estimate it, with no more than two homographies.
     """
     squares = [(row, column) for row in range(64) for column in range(columns) if (row + column + first) % 2 == 1]
     if max(d.id for d in found) >= len(squares):
@@ -138,7 +139,7 @@ def _explain(
 
 
 def _crossing(quad: NDArray[Any]) -> NDArray[Any]:
-    """Return where a quadrilateral's diagonals meet: the middle of a square, in perspective."""
+    """Return the intersection of a quadrilateral's diagonals: the projected centre of a square."""
     a, b, c, d = (np.append(corner, 1.0) for corner in quad)
     point = np.cross(np.cross(a, c), np.cross(b, d))
     return np.asarray(point[:2] / point[2])

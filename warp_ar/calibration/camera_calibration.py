@@ -1,4 +1,4 @@
-"""Pinhole and distortion, or fisheye, of a camera from views of a ChArUco board.
+"""Calibration of a camera (pinhole with distortion, or fisheye) from views of a ChArUco board.
 
 References:
     [Z00] Z. Zhang. A flexible new technique for camera calibration. PAMI 2000.
@@ -29,52 +29,52 @@ from warp_ar.tracking.markers import make_board
 
 Image = NDArray[np.uint8]
 _Views: TypeAlias = list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]
-"""Corners of each view in pixels, their numbers, and their places on the board."""
+"""For each view: corners in pixels, their ids, and their positions on the board."""
 
 _MOVED = 0.03
-"""Share of the picture's diagonal that a board's corners must have moved for another view of it to be taken."""
+"""Mean movement of a board's corners, relative to the picture's diagonal, from which a view counts as new."""
 _MOST_VIEWS = 60
-"""Views that are used at most: more cost time and add nothing."""
+"""Largest number of views; more take time without improving the result."""
 _FEWEST_VIEWS = 4
-"""Views without which the focal length is not determined with any certainty."""
+"""Smallest number of views that determine the focal length."""
 GOOD_VIEWS = 12
-"""Views below which a warning is due."""
+"""Number of views below which a warning is given."""
 _GROUPS = 15
-"""Groups of views that are left out in turn: more cost time and tell the same."""
+"""Number of groups of views that are left out in turn; more take time without improving the estimate."""
 LEAST_TILT = 15.0
-"""Least range of the board's tilt, degrees; below it focal length and distance are ambiguous."""
+"""Smallest range of the board's tilt, degrees; below it, focal length and distance are ambiguous."""
 MOST_FOCAL = 0.03
-"""Share of the focal length that its interval of two standard deviations may have."""
+"""Largest interval (two standard deviations) of the focal length, relative to it."""
 _COVERAGE_CELLS = (4, 6)
-"""Rows and columns into which the picture is cut to see where the board has been."""
+"""Rows and columns of the grid that records where in the picture the board was seen."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraReport:
-    """A calibrated camera and how far to trust it."""
+    """Calibrated camera with its uncertainty."""
 
     camera: Camera
-    """The camera; its transfer is not measured here."""
+    """The camera; its transfer is not calibrated."""
     error: float
     """Root mean square reprojection error, pixels."""
     view_errors: tuple[float, ...]
-    """The same for each view that was used."""
+    """Root mean square reprojection error of each view, pixels."""
     focal_deviation: float
     """Standard deviation of the focal length, pixels."""
     coverage: float
-    """Share of the picture's cells where the board has been."""
+    """Share of the picture's grid cells in which the board was seen."""
     warnings: tuple[str, ...]
-    """Advice that would make it better, one line each."""
+    """Advice for a better calibration, one line each."""
     marker: Marker
-    """The board that was seen."""
+    """The board."""
     tilts: tuple[float, float]
-    """Least and most that the board was tilted, degrees: of views that are alike, a deviation says nothing."""
+    """Smallest and largest tilt of the board, degrees; for similar views, ``focal_deviation`` is too small."""
     fisheye: tuple[float, ...] = ()
-    """k1 k2 k3 k4 of a fisheye, whose picture the camera's distortion follows; empty for a pinhole."""
+    """k1 k2 k3 k4 of a fisheye that the camera's distortion approximates; empty for a pinhole."""
 
     @property
     def doubt(self) -> str:
-        """Reason to reject the focal length; empty if it is good."""
+        """Return the reason to reject the focal length; empty if it is accepted."""
         if self.tilts[1] - self.tilts[0] < LEAST_TILT:
             return f"the card was tilted by {self.tilts[0]:.0f} to {self.tilts[1]:.0f} degrees only"
         if (share := 2 * self.focal_deviation / self.camera.fx) > MOST_FOCAL:
@@ -83,25 +83,25 @@ class CameraReport:
 
 
 class BoardViews:
-    """Different views of a ChArUco board, collected until they calibrate a camera [Z00]."""
+    """Distinct views of a ChArUco board, collected until they suffice for calibration [Z00]."""
 
     def __init__(
         self, marker: Marker | None = None, board: CharucoBoard | None = None, *, fisheye: bool = False
     ) -> None:
-        """Collect nothing yet.
+        """Start without views.
 
         Args:
-            marker: the board that was printed; None: whichever ChArUco board the first picture of one shows.
-            board: its layout, where only the dictionary is to be told from the pictures.
-            fisheye: Whether the lens is one.
+            marker: the printed board; None: the ChArUco board in the first picture that shows one.
+            board: layout of the board, if only the dictionary must be recognised.
+            fisheye: True for a fisheye lens.
 
         Raises:
-            UsageError: if it is no ChArUco board.
+            UsageError: if the marker is no ChArUco board.
         """
         if marker is not None and not isinstance(marker.board, CharucoBoard):
             raise UsageError(f'--board: the camera is calibrated with a ChArUco board, such as "{SHEET.board}"')
         self.marker: Marker | None = None
-        """The board, as soon as it is known."""
+        """The board, or None until it is recognised."""
         self._layout, self._fisheye = board, fisheye
         self._board: Any = None
         self._detector: Any = None
@@ -126,10 +126,10 @@ class BoardViews:
         self._detector = cv2.aruco.CharucoDetector(self._board)
 
     def add(self, image: Image) -> bool:
-        """Take a picture, RGB or grey uint8; True if it shows the board as none before.
+        """Add a picture, RGB or grey uint8; return True if it is a new view of the board.
 
         Raises:
-            UsageError: if its size is not the first one's.
+            UsageError: if its size differs from that of the first picture.
         """
         size = (image.shape[1], image.shape[0])
         self._size = self._size or size
@@ -144,7 +144,7 @@ class BoardViews:
                 return False
             self._take(seen)
         corners, ids, _, _ = self._detector.detectBoard(gray)
-        # Corners on one line, or fewer than six, leave a view's pose open.
+        # Collinear corners, or fewer than six, do not determine a view's pose.
         if ids is None or len(ids) < 6 or self._board.checkCharucoCornersCollinear(ids):
             return False
         corners, ids = np.asarray(corners).reshape(-1, 2), np.ravel(ids)
@@ -155,14 +155,14 @@ class BoardViews:
         return True
 
     def covered(self) -> NDArray[np.bool_]:
-        """Return where in the picture the board has been, by rows and columns."""
+        """Return a mask, by rows and columns of the picture's grid, of cells in which the board was seen."""
         return _covered(self.views, self._size or (1, 1))
 
     def solve(self) -> CameraReport:
-        """Pinhole and distortion, by [KB06] of a fisheye.
+        """Calibrate the camera: pinhole with distortion, or fisheye [KB06].
 
         Raises:
-            UsageError: if too few views show the board, or the lens is wider than is followed.
+            UsageError: if too few views show the board, or the lens is wider than supported.
         """
         size, fisheye = self._size, self._fisheye
         if size is None or self.marker is None or len(self.views) < _FEWEST_VIEWS:
@@ -172,7 +172,7 @@ class BoardViews:
                 f"expected {_FEWEST_VIEWS} at the least, {GOOD_VIEWS} for a good result"
             )
         result = _calibrate(self.views, size, fisheye)
-        # A blurred or bent view must not spoil the others.
+        # Blurred views and views of a bent board are removed.
         most = 3 * np.median(result.view_errors)
         kept = [view for view, error in zip(self.views, result.view_errors, strict=True) if error <= most]
         if len(kept) < len(self.views) and len(kept) >= _FEWEST_VIEWS:
@@ -222,17 +222,17 @@ def calibrate_camera(
     *,
     fisheye: bool = False,
 ) -> CameraReport:
-    """Pinhole and distortion from views of a ChArUco board.
+    """Calibrate a camera from views of a ChArUco board.
 
     Args:
-        images: RGB or grey uint8 pictures, all of one size; views that hardly differ from earlier ones are skipped.
-        marker: the board that was printed; None: whichever the pictures show.
-        board: its layout, where only the dictionary is to be told from the pictures.
-        fisheye: Whether the lens is one.
+        images: RGB or grey uint8 pictures, all of one size; views similar to earlier ones are skipped.
+        marker: the printed board; None: the board in the pictures.
+        board: layout of the board, if only the dictionary must be recognised.
+        fisheye: True for a fisheye lens.
 
     Raises:
-        UsageError: if the board is no ChArUco board, sizes differ, too few views show it, or the lens is wider than is
-            followed.
+        UsageError: if the board is no ChArUco board, sizes differ, too few views show it, or the lens is wider than
+            supported.
     """
     views = BoardViews(marker, board, fisheye=fisheye)
     for image in images:
@@ -250,33 +250,33 @@ def _covered(views: _Views, size: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def _moved(corners: NDArray[Any], ids: NDArray[Any], others: NDArray[Any], other_ids: NDArray[Any]) -> float:
-    """Mean distance in pixels between the corners that two views share; infinite if none."""
+    """Return the mean distance in pixels between the corners that two views share; infinite if they share none."""
     _, here, there = np.intersect1d(ids, other_ids, return_indices=True)
     return float(np.linalg.norm(corners[here] - others[there], axis=1).mean()) if len(here) else math.inf
 
 
 @dataclasses.dataclass(frozen=True)
 class _Solution:
-    """A camera that fits views."""
+    """Camera model fitted to views."""
 
     error: float
     """Root mean square reprojection error, pixels."""
     matrix: NDArray[Any]
     distortion: NDArray[Any]
-    """k1 k2 p1 p2 k3 of a pinhole, k1 k2 k3 k4 of a fisheye."""
+    """k1 k2 p1 p2 k3 for a pinhole, k1 k2 k3 k4 for a fisheye."""
     rotations: Sequence[NDArray[Any]]
-    """Rotation vectors of the board in each view."""
+    """Rotation vector of the board in each view."""
     deviation: float
-    """Standard deviation of the focal length by independent corners, pixels; 0: not known."""
+    """Standard deviation of the focal length if corners were independent, pixels; 0: unknown."""
     view_errors: NDArray[Any]
-    """``error`` of each view."""
+    """Root mean square reprojection error of each view, pixels."""
 
 
 def _calibrate(views: _Views, size: tuple[int, int], fisheye: bool) -> _Solution:
     if fisheye:
         return _solve_fisheye(views, size)
     plain, full = (_solve(views, size, flags) for flags in (cv2.CALIB_FIX_K3, 0))
-    # The sixth-order term bends the corners of the picture wildly where it only fits noise.
+    # The sixth-order term is left out where it would only fit noise and distort the picture's corners.
     return full if full.error < 0.9 * plain.error else plain
 
 
@@ -316,9 +316,9 @@ def _rational(size: tuple[int, int], matrix: NDArray[Any], terms: tuple[float, .
 
 
 def _spread(views: _Views, size: tuple[int, int], fisheye: bool) -> float:
-    """Standard deviation of the focal length by leaving out views in turn (the jackknife), pixels.
+    """Return the standard deviation of the focal length in pixels, by leaving out groups of views in turn (jackknife).
 
-    Corners of one view are off alike (its blur, what the lens does beside the model), so that the deviation by
+    Errors of corners in one view are correlated (blur, lens effects outside the model), so a deviation that assumes
     independent corners is too small. With f_g the focal length without group g of n,
 
         s^2 = (n - 1) / n  sum_g (f_g - mean f)^2.
@@ -341,11 +341,11 @@ def _place(row: int, column: int) -> str:
 
 
 def write_camera(report: CameraReport, path: Path) -> None:
-    """Write OpenCV's YAML (or JSON or XML, by the name's ending).
+    """Write a camera as OpenCV's YAML, or by the suffix as JSON or XML.
 
     Raises:
         SinkError: The file cannot be written.
-        UsageError: Its name has another ending.
+        UsageError: The path has another suffix.
     """
     if path.suffix.lower() not in (".yml", ".yaml", ".json", ".xml"):
         raise UsageError(f"--output {path}: expected a name that ends in .yml, .json or .xml")

@@ -1,4 +1,4 @@
-"""Markers and boards as pages that print at exact size."""
+"""Pages with markers and boards that print at exact size."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from warp_ar.tracking.markers import find_dictionary, make_board
 Image = NDArray[np.uint8]
 
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-"""Width and height of paper in millimetres, upright."""
+"""Width and height of paper in millimetres, in portrait format."""
 _MARGIN = 10.0
-"""Millimetres at the paper's edges that printers leave white."""
+"""Margin in millimetres at the paper's edges that printers leave blank."""
 
 
 def card_size(marker: Marker) -> tuple[float, float]:
-    """Width and height in metres of a marker or board without its white margin."""
+    """Return width and height in metres of a marker or board without its white margin."""
     return marker.board.size if marker.board is not None else (marker.size, marker.size)
 
 
 def draw_card(marker: Marker, pixels_per_metre: float) -> Image:
-    """The marker or board with a white margin of one cell and more, each edge at its nearest pixel.
+    """Draw the marker or board with a white margin of at least one cell, each edge at its nearest pixel.
 
     Args:
         marker: what to draw.
         pixels_per_metre: resolution.
 
     Returns:
-        uint8 (h, w), 0 or 255, the marker in its centre.
+        Picture, uint8 (h, w), 0 or 255, with the marker in its centre.
     """
     dictionary = find_dictionary(marker.dictionary)
     bits = int(dictionary.markerSize) + 2
@@ -74,16 +74,16 @@ def draw_card(marker: Marker, pixels_per_metre: float) -> Image:
 
 
 def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0) -> None:
-    """Write a page that prints at true size: a PDF or a PNG, by the name's ending.
+    """Write a page that prints at true size, as PDF or PNG by the suffix.
 
     Args:
-        marker: What to print; ``SHEET`` becomes the whole card, any other one gets its name and a bar of 100 mm.
+        marker: Marker to print; ``SHEET`` gives the whole card, others get their name and a bar of 100 mm.
         path: The file.
         paper: A name of ``PAPERS``.
         dpi: Dots per inch.
 
     Raises:
-        UsageError: The card does not fit on the paper, or the name ends otherwise.
+        UsageError: The card does not fit on the paper, or the path has another suffix.
         SinkError: The file cannot be written.
     """
     if paper not in PAPERS:
@@ -92,7 +92,7 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
         raise UsageError(f"--dpi {dpi:g}: expected 72 to 2400 dots per inch")
     if path.suffix.lower() not in (".pdf", ".png"):
         raise UsageError(f"--output {path}: expected a name that ends in .pdf or .png")
-    # PNG stores whole pixels per metre: drawn at that resolution, the print is exact.
+    # PNG stores whole pixels per metre: with that resolution, the print is exact.
     per_metre = round(dpi / 0.0254)
     if marker == SHEET:
         width, height = PAPERS[paper]
@@ -103,7 +103,7 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
 
 
 def _draw_page(marker: Marker, paper: str, per_metre: int) -> Image:
-    """A page with a marker or board, its name and a bar of 100 mm to check the printer with."""
+    """Draw a page with a marker or board, its name, and a bar of 100 mm to check the printer."""
     width, height = PAPERS[paper]
     card_mm = [1e3 * length for length in card_size(marker)]
     foot = 15.0
@@ -138,7 +138,7 @@ def _png(page: Image, per_metre: int) -> bytes:
 
 
 def _pdf(page: Image, per_metre: int) -> bytes:
-    """A page of one bit per pixel as PDF 1.4, whose size on paper is exactly that of its pixels."""
+    """Return a page with one bit per pixel as PDF 1.4 with exactly the paper size of its pixels."""
     rows, columns = page.shape
     width, height = (length / per_metre / 0.0254 * 72 for length in (columns, rows))
     bits = zlib.compress(np.packbits(page > 127, axis=1).tobytes(), 9)
@@ -154,7 +154,7 @@ def _pdf(page: Image, per_metre: int) -> bytes:
         + bits
         + b"\nendstream",
     ]
-    # The second line tells programs that the file is binary; the third is this program's signature.
+    # The second line marks the file as binary; the third is this program's signature.
     out = bytearray(b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n% " + PROGRAM.encode() + b"\n")
     offsets = []
     for number, body in enumerate(objects, 1):

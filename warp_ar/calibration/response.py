@@ -1,22 +1,23 @@
-"""Response curve of a camera, from the printed card's greys or from one still scene at several exposures.
+"""Measurement of a camera's response curve, from the printed card or from a static scene at several exposures.
 
 A response file is text: 256 lines of three numbers, the linear red, green and blue value of each 8-bit code, 1 for code
 255; a line that begins with # is a comment.
 
-The card's greys are dots of black ink that cover a known share of the paper, too small for a camera: what a patch
-reflects, over what white paper reflects, is 1 - s (1 - k) with the share s and black ink over white paper k. So each
-picture shows the curve at five known ratios, and the board's own black and white tell how light falls off across the
-card. One picture cannot tell a curve from ink that spreads; pictures of several exposures, in which a patch is seen at
-several codes, can in part.
+The card's grey patches consist of dots of black ink that cover a known share of the paper and are too small for a
+camera. The reflectance of a patch relative to white paper is 1 - s (1 - k), with the share s and the ratio k of black
+ink to white paper. Each picture therefore shows the curve at five known ratios, and the board's black and white show
+the gradient of the light across the card. One picture cannot separate the curve from the spread of ink; pictures at
+several exposures, which show a patch at several codes, can in part.
 
-The curve is sRGB's with another gamma, another toe and a bend, as tone curves have:
+The curve is modelled as sRGB's with another gamma, another toe, and a bend as in tone curves:
 
     ln L(c) = ln L_srgb(c) + t_1 ln c + t_2 (ln L_srgb(c) - 2.2 ln c) + t_3 (1 - c) + t_4 (1 - c)^2,    L(1) = 1.
 
-Gammas of 1.8 to 2.6 with an S are met within 1 %, rarely 3 %, down to code 20. So ln L of an observed code is linear in
-t, in the exposure and in the light's slope across the card; only k and the ink's spread are not. A few steps of
-Gauss-Newton with priors solve for all. The inverse of the normal matrix, times the residuals' spread, is the covariance
-that gives the interval: most of it is what ink that spreads does to the greys.
+Gammas of 1.8 to 2.6 with an S-shape are reproduced within 1 %, rarely 3 %, down to code 20. Thus ln L of an observed
+code is linear in t, in the exposure and in the light's gradient across the card; only k and the ink's spread are
+nonlinear. A few steps of Gauss-Newton with priors solve for all. The inverse of the normal matrix, times the variance
+of the residuals, is the covariance that gives the interval. Its largest part is the effect of ink spread on the grey
+patches.
 
 References:
     [DM97] P. Debevec and J. Malik. Recovering high dynamic range radiance maps from photographs. SIGGRAPH 1997.
@@ -45,58 +46,58 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 MOST: Final = 24
-"""Pictures that are used at most."""
+"""Largest number of pictures used."""
 FEWEST: Final = 2
-"""Least number of pictures that separate a gradient of the light from the curve."""
+"""Smallest number of pictures that separate a gradient of the light from the curve."""
 CORNERS: Final = 8
-"""Corners of the board without which no patch is placed exactly."""
+"""Smallest number of detected board corners for locating the patches."""
 RANGE: Final = (8.0, 248.0)
-"""Codes that are neither crushed nor clipped."""
+"""Range of codes that are neither crushed nor clipped."""
 RESOLVED: Final = 9.0
-"""Standard deviation of a patch's codes above which its dots are seen one by one, and its mean means nothing."""
+"""Standard deviation of a patch's codes above which its dots are resolved, so that its mean code is meaningless."""
 FLAT: Final = 3.0
-"""Standard deviation of the codes of a cell that no neighbour's blur reaches."""
+"""Largest standard deviation of the codes of a cell that is not affected by its neighbours' blur."""
 SPAN: Final = 90.0
-"""Codes from the darkest to the brightest sample that a curve needs."""
+"""Smallest range of codes, from the darkest to the brightest sample, that determines a curve."""
 BLACK: Final = (0.055, 0.5)
-"""Black ink over white paper: what is expected, and the standard deviation of its logarithm."""
+"""Expected ratio of black ink to white paper, and the standard deviation of its logarithm."""
 SPREAD: Final = 0.03
-"""Standard deviation of what ink that spreads adds to a share of one half."""
+"""Standard deviation of the coverage that ink spread adds to a share of one half."""
 CODE_ERROR: Final = 0.8
-"""Standard error in codes of a patch's or cell's mean: noise, compression, blur from beside it."""
+"""Standard error in codes of a patch's or cell's mean: noise, compression, neighbouring blur."""
 EVEN: Final = (0.01, 0.04)
-"""Standard deviation of the logarithm of light from a patch, and from a zone's cells, that nothing here explains: cells
-are small, and what their neighbours' blur adds to them is the same in all zones."""
+"""Standard deviations of the logarithm of a patch and of a zone's cells that the model does not explain; cells are
+small, and the blur from neighbours is the same in all zones."""
 BENDS: Final = ((0.0, 0.5), (-0.5, 0.5), (0.0, 0.5), (0.5, 1.0))
-"""Expectation of t_1 to t_4, and its standard deviation."""
+"""Mean and standard deviation of the priors on t_1 to t_4."""
 MISFIT: Final = 0.07
-"""Standard deviation of the logarithm of what curves of this form miss of a camera's, in the darks; toward code 255,
-where all curves meet, it falls as the square root of what is left."""
+"""Standard deviation of the logarithm, in dark regions, of a camera's curve from curves of this form; toward code 255,
+where all curves meet, it decreases as the square root of the remaining range."""
 MOST_DEVIATION: Final = 0.25
-"""Share of a middle code's value that its interval may have: usual cameras differ from sRGB by as much."""
+"""Largest interval of a middle code's value, relative to it; common cameras differ from sRGB by as much."""
 COUNTED: Final = 5
-"""Pictures beyond which more tell nothing new: what compression and the curve's form miss is alike in all of them, and
-must not outvote what is expected of the curve and the ink."""
+"""Number of pictures beyond which more add no information: errors of compression and of the curve's form are the same
+in all of them, and must not outweigh the priors."""
 ZONES: Final = 3
-"""The board's cells are averaged over so many zones along x and y: neighbours share what is wrong with them."""
+"""Number of zones along x and y over which the board's cells are averaged, because neighbours have the same errors."""
 _LIMITS: Final = ((0.015, 0.25), (-0.1, 0.1))
-"""Bounds of k and of the ink's spread; beyond them a flat curve would fit anything."""
+"""Bounds of k and of the ink's spread; without them a flat curve would fit any picture."""
 _STEPS: Final = 12
 _TERMS: Final = len(BENDS)
 
 
 def measure_response(images: Sequence[Image], exposures: Sequence[float]) -> Array:
-    """Linear value of each 8-bit code, from pictures of one still scene at several exposure times [DM97].
+    """Return the linear value of each 8-bit code, from pictures of a static scene at several exposure times [DM97].
 
     Args:
         images: RGB uint8 pictures of one size, taken without moving the camera.
         exposures: their exposure times in seconds; only ratios matter.
 
     Returns:
-        (256, 3) red, green and blue, rising, 1 at code 255.
+        Red, green and blue, (256, 3), increasing, with 1 at code 255.
 
     Raises:
-        UsageError: if there are too few pictures, they differ in size, or exposures are impossible.
+        UsageError: if there are too few pictures, they differ in size, or exposures are invalid.
     """
     if len(images) < 3 or len(images) != len(exposures):
         raise UsageError(
@@ -108,14 +109,14 @@ def measure_response(images: Sequence[Image], exposures: Sequence[float]) -> Arr
         raise UsageError(
             f"exposures {', '.join(f'{e:g}' for e in exposures)}: expected times above 0 that differ by 2 or more"
         )
-    # More samples than OpenCV's 70, and smoother than its 10: 8-bit noise must not bend the curve.
+    # More samples than OpenCV's 70, and more smoothing than its 10, so that 8-bit noise does not distort the curve.
     calibrate = cv2.createCalibrateDebevec(samples=300, lambda_=50.0, random=False)
     curve = np.asarray(calibrate.process(list(images), np.asarray(exposures, np.float32)), float).reshape(256, 3)
     if not np.isfinite(curve).all() or (curve <= 0).any():
         raise UsageError(
             "the exposures do not determine a response: are all pictures of one scene, neither black nor white?"
         )
-    # Noise at the ends may bend the curve down; a response only rises.
+    # Noise may make the ends of the curve decrease; a response only increases.
     curve = np.maximum.accumulate(curve, axis=0)
     curve -= curve[0]
     if (curve[-1] <= 0).any():
@@ -135,21 +136,21 @@ def write_response(curve: Array, path: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class GreyResponse:
-    """A response curve and how far it is known."""
+    """Response curve with its uncertainty."""
 
     curve: Array
     """Linear value of each code, (256, 3), 1 at code 255."""
     deviation: Array
     """Relative standard deviation of each value, (256, 3)."""
     views: int
-    """Pictures that were used."""
+    """Number of pictures used."""
     span: tuple[float, float]
-    """Lowest and highest code that was seen; beyond them the curve goes on as cameras' curves do."""
+    """Lowest and highest observed code; beyond them the curve is extrapolated by the model."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Samples:
-    """Samples of the card in one picture: places (n, 2) in metres, shares of ink (n,), codes (n, 3)."""
+    """Samples of the card in one picture: positions (n, 2) in metres, shares of ink (n,), codes (n, 3)."""
 
     places: Array
     shares: Array
@@ -157,13 +158,13 @@ class _Samples:
 
 
 def measure_grey_response(images: Iterable[Image]) -> GreyResponse:
-    """The response curve by the card's greys.
+    """Measure the response curve from the card's grey patches.
 
     Args:
-        images: RGB uint8 pictures of the printed card, best of several exposures or under changing light.
+        images: RGB uint8 pictures of the printed card, ideally at several exposures or under changing light.
 
     Raises:
-        UsageError: Too few of them show the card, its dots are seen one by one, or all of it has one brightness.
+        UsageError: Too few pictures show the card, its dots are resolved, or its contrast is too low.
     """
     found, resolved, count = [], 0, 0
     for image in images:
@@ -195,13 +196,13 @@ def measure_grey_response(images: Iterable[Image]) -> GreyResponse:
 
 
 def _sample(image: Image) -> _Samples | None:
-    """Patches and cells of one picture; None where the card is not seen, empty where its dots are."""
+    """Return patches and cells of one picture; None without a visible card, empty if its dots are resolved."""
     gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     board = make_board(SHEET)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
     if ids is None or len(ids) < CORNERS:
         return None
-    # OpenCV's board has its origin at a corner and y down the page, the card at its middle and y up.
+    # OpenCV's board has its origin at a corner with y down the page; the card has it at the centre with y up.
     assert SHEET.board is not None
     width, height = SHEET.board.size
     flat = np.asarray(board.getChessboardCorners(), float)[np.ravel(ids)][:, :2]
@@ -226,7 +227,7 @@ def _sample(image: Image) -> _Samples | None:
 
 
 def _add_cells(image: Image, matrix: Array, places: list[Array], shares: list[float], codes: list[Array]) -> None:
-    """Add the board's white and black, averaged over zones."""
+    """Add the board's white and black cells, averaged over zones."""
     cells, white, side, _ = printed_cells(SHEET)
     middle = np.column_stack([a.ravel() for a in np.meshgrid(*[np.linspace(-0.15, 0.15, 3) * side] * 2)])
     extent = np.abs(cells[:, :2]).max(0)
@@ -236,7 +237,7 @@ def _add_cells(image: Image, matrix: Array, places: list[Array], shares: list[fl
             kept = []
             for cell in cells[(zone == number) & (white == is_white), :2]:
                 seen = _codes_at(image, matrix, cell + middle)
-                # A cell that a neighbour's blur reaches is no flat white or black.
+                # A cell affected by a neighbour's blur is not uniform.
                 if seen is not None and seen.std(0).max() < FLAT:
                     kept.append((cell, seen.mean(0)))
             if len(kept) >= 3:
@@ -246,7 +247,7 @@ def _add_cells(image: Image, matrix: Array, places: list[Array], shares: list[fl
 
 
 def _codes_at(image: Image, matrix: Array, points: Array) -> Array | None:
-    """Codes (n, 3) at points (n, 2) of the card; None outside the picture."""
+    """Return codes (n, 3) at points (n, 2) of the card; None if any is outside the picture."""
     pixels = cv2.perspectiveTransform(points.reshape(-1, 1, 2), matrix).reshape(-1, 2)
     if (pixels < 1).any() or (pixels > (image.shape[1] - 2, image.shape[0] - 2)).any():
         return None
@@ -255,13 +256,13 @@ def _codes_at(image: Image, matrix: Array, points: Array) -> Array | None:
 
 
 def _log_srgb(code: Array) -> Array:
-    """Logarithm of sRGB's linear value of codes 0 to 1."""
+    """Return the logarithm of sRGB's linear value of codes from 0 to 1."""
     value: Array = decode_srgb(code)
     return np.log(np.maximum(value, 1e-6))
 
 
 def _bends(code: Array) -> Array:
-    """Return what t_1 to t_4 are factors of, (n, 4)."""
+    """Return the factors of t_1 to t_4, (n, 4)."""
     log = np.log(np.maximum(code, 1.0 / 255.0))
     return np.stack([log, _log_srgb(code) - 2.2 * log, 1.0 - code, (1.0 - code) ** 2], -1)
 
@@ -271,13 +272,16 @@ def _log_curve(code: Array, terms: Array) -> Array:
 
 
 def _reflected(share: Array, black: float, spread: float) -> Array:
-    """Logarithm of what a share of ink reflects over white paper; ``spread`` is what a half gains."""
+    """Return the logarithm of the reflectance of an ink share relative to white paper.
+
+    ``spread`` is the gain at one half.
+    """
     inked = np.clip(share + 4.0 * spread * share * (1.0 - share), 0.0, 1.0)
     return np.log(1.0 - inked * (1.0 - black))
 
 
 def _solve(found: list[_Samples], channel: int) -> tuple[Array, Array]:
-    """Curve (256,) and relative deviation (256,) of one channel."""
+    """Return the curve (256,) and its relative deviation (256,) of one channel."""
     view, places, shares, codes, even = _joined(found, channel)
     if len(codes) == 0 or np.ptp(codes) * 255.0 < SPAN:
         low, high = (255.0 * end for end in (codes.min(initial=1.0), codes.max(initial=0.0)))
@@ -298,8 +302,8 @@ def _solve(found: list[_Samples], channel: int) -> tuple[Array, Array]:
     solved[:_TERMS] = means
     say = math.sqrt(min(1.0, COUNTED / float(count)))
     for _ in range(_STEPS):
-        # Errors of a code are those of its logarithm times the curve's slope there. The slope must be the curve's own:
-        # with another's, the flatter a curve is the better it fits.
+        # The error of a code times the curve's slope is the error of the logarithm. The slope must be that of the
+        # current curve: otherwise flat curves would fit best.
         ahead, behind = (_log_curve(codes + step, solved[:_TERMS]) for step in (0.003, -0.003))
         weight = say / np.hypot(CODE_ERROR / 255.0 * np.maximum((ahead - behind) / 0.006, 0.3), even)
         now = _reflected(shares, math.exp(black), spread)
@@ -314,14 +318,14 @@ def _solve(found: list[_Samples], channel: int) -> tuple[Array, Array]:
         black = float(np.clip(black + solved[_TERMS], *np.log(_LIMITS[0])))
         spread = float(np.clip(spread + solved[_TERMS + 1], *_LIMITS[1]))
     rest = design @ solved - target
-    # Samples of one picture share what is wrong with them: the pictures and patches count, not the cells.
+    # Errors of samples in one picture are correlated: pictures and patches count, not cells.
     excess = max(float((rest**2).mean()) / say**2, 1.0)
     covariance = np.asarray(np.linalg.inv(normal) * excess, float)
     return _curve(np.asarray(solved[:_TERMS], float), covariance[:_TERMS, :_TERMS])
 
 
 def _joined(found: list[_Samples], channel: int) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
-    """Picture, place, share, code (0 to 1) and ``EVEN`` of all samples that are neither crushed nor clipped."""
+    """Return picture index, position, share, code (0 to 1) and ``EVEN`` of all usable samples."""
     view = np.concatenate([np.full(len(samples.shares), k) for k, samples in enumerate(found)])
     places, shares = (np.concatenate([getattr(samples, name) for samples in found]) for name in ("places", "shares"))
     codes = np.concatenate([samples.codes[:, channel] for samples in found])
@@ -335,7 +339,7 @@ def _curve(terms: Array, covariance: Array) -> tuple[Array, Array]:
     codes = np.arange(256) / 255.0
     bends = _bends(codes)
     curve = np.exp(_log_curve(codes, terms))
-    # A response only rises, from nothing.
+    # A response only increases, from zero.
     curve = np.maximum.accumulate(np.where(codes > 0, curve, 0.0))
     deviation = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", bends, covariance, bends), 0.0))
     return curve / curve[-1], np.hypot(deviation, MISFIT * np.sqrt(1.0 - codes))

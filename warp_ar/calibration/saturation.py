@@ -1,34 +1,34 @@
 """Codes at which a camera's channels saturate, estimated from pictures.
 
-A sensor that saturates need not give 255: limited range, a shoulder or tone mapping may end at 235 or 238. What lies
-above that light is lost all the same, and code 238 taken for a radiance of 0.85 hides that a lamp clips.
+A saturated sensor need not give code 255: limited range, a shoulder or tone mapping may end at 235 or 238. Brighter
+light is clipped there as well, and taking code 238 for a radiance of 0.85 hides that a lamp clips.
 
-Saturation shows as a plateau: of the codes inside the mirror ball, where lamps and windows are seen, many are the same
-and none is higher. Surfaces that are evenly lit crowd too, but around a mean, with noise to both sides. So a level L
-below 254 is believed where, in the ball,
+Saturation appears as a plateau: inside the mirror ball, where lamps and windows are visible, many codes are equal and
+none is higher. Evenly lit surfaces also have similar codes, but with noise to both sides of a mean. A level L below 254
+is therefore accepted if, inside the ball,
 
-- codes L - 1 to L + 1 are more than ``LEAST_SHARE`` of all, and at least ``LEAST_PIXELS``;
-- they are ``STEEP`` times as frequent as the three codes before them: no bell has such a flank;
-- next to nothing, ``ABOVE`` of them, is higher: rounding of a codec.
+- codes L - 1 to L + 1 are more than ``LEAST_SHARE`` of all pixels, and at least ``LEAST_PIXELS``;
+- they are ``STEEP`` times as frequent as the three codes below them: no bell curve has such a flank;
+- at most the share ``ABOVE`` of them is higher, by rounding of a codec.
 
-Compression throws the channels' codes to both sides of a plateau, up to some ten, but hardly their luma: it keeps that
-in full resolution. So a plateau of luma counts for all channels where its pixels are neutral: lamps drive all channels
-to the end, and few surfaces are so neutral.
+Compression spreads the channels' codes around a plateau by up to ten codes, but hardly the luma, which has full
+resolution. A plateau of luma therefore counts for all channels if its pixels are neutral: lamps saturate all channels,
+and few surfaces are as neutral.
 
-Where sharpening and hard compression blur a plateau too far for that, a camera that meters for itself tells all the
-same: what it shows of a lit surface moves with its gain, and a plateau does not. So where the top of the luma in the
-ball, neutral as above, stays within ``STILL`` codes over frames whose gains differ by ``MOVED`` and more, it is the
-level: a surface would have moved by some ten codes.
+Sharpening and strong compression may blur a plateau too much for this test. With automatic exposure there is a second
+one: the code of a lit surface changes with the camera's gain, a plateau does not. If the top of the ball's luma,
+neutral as above, stays within ``STILL`` codes over frames whose gains differ by at least ``MOVED``, it is the level; a
+surface would have changed by about ten codes.
 
-Before anything drifts such a top is a level only where two more things say so: the camera lays a tone curve over what
-it shows, as cameras do that end early, and next to nothing in the whole picture is brighter. A lit wall in the ball is
-dimmed by it: the wall itself, or paper, is brighter beside it. It is taken back where it moves with the gain after all.
+Before any drift, such a top is a level only under two more conditions: the camera applies a tone curve, as cameras that
+end early do, and almost nothing in the whole picture is brighter. (A lit wall appears darker in the ball than
+directly.) The level is withdrawn if it changes with the gain later.
 
-A level that was seen holds for all frames after it, for the camera is the same. A frame whose codes heap up at 254 and
-255 anywhere in the picture takes it back for good.
+An accepted level holds for all later frames, because the camera is the same. It is withdrawn permanently if a frame has
+a concentration of codes 254 and 255 anywhere in the picture.
 
-Frames of more than 8 bits are asked in the same way, by their codes rounded to 8. Where the plateau lies between two of
-these is the median of what was rounded to its code: a channel that ends at code 950 of 1023 ends at 236.8 of 255.
+Frames with more than 8 bits are tested in the same way, with codes rounded to 8 bits. The plateau's exact level is the
+median of the codes that were rounded to it: a channel that ends at code 950 of 1023 ends at 236.8 of 255.
 """
 
 from __future__ import annotations
@@ -44,72 +44,73 @@ from warp_ar.scene.pose import Pose
 from warp_ar.sources.deep_frame import Plate
 
 FULL = 255
-"""Code at which channels saturate unless pictures say otherwise."""
+"""Default saturation code of all channels."""
 LEAST_LEVEL = 200
-"""Code below which no camera is taken to saturate."""
+"""Smallest code accepted as a saturation level."""
 NEAR_FULL = 253
-"""Level from which on the usual one is meant: codecs lower 255 by one or two."""
+"""Level from which on the default is meant, because codecs lower 255 by one or two."""
 LEAST_PIXELS = 8
-"""Pixels of the ball that a plateau has."""
+"""Smallest number of the ball's pixels on a plateau."""
 LEAST_SHARE = 1e-3
-"""Share of the ball's pixels that it has."""
+"""Smallest share of the ball's pixels on a plateau."""
 STEEP = 4.0
-"""Ratio of a plateau's pixels to those of as many codes before it."""
+"""Smallest ratio of a plateau's pixels to those of as many codes below it."""
 ABOVE = 0.05
-"""Share of a plateau's pixels that may be higher: rounding."""
+"""Largest share, relative to a plateau's pixels, of higher codes, caused by rounding."""
 ABOVE_LUMA = 0.15
-"""The same of a plateau of luma."""
+"""Largest share of higher codes for a plateau of luma."""
 NEUTRAL = 3.0
-"""Codes by which the median pixel of a plateau of luma may be off it, in each channel."""
+"""Largest deviation, in codes, of the median pixel of a luma plateau from it, in each channel."""
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of luma in JPEG and most video, ITU-R BT.601."""
 RINGING = 17
-"""Codes by which compression exceeds a plateau."""
+"""Largest overshoot in codes above a plateau, by compression."""
 LEAST_HEAP = 2e-4
-"""Share of the whole picture that has codes 254 and 255 where a channel saturates at them."""
+"""Share of the whole picture with codes 254 and 255 if a channel saturates there."""
 INSIDE = 0.95
-"""Share of the ball's radius within which pixels are the ball's for certain."""
+"""Share of the ball's radius within which pixels certainly belong to the ball."""
 WATCHED = 24
-"""First frames of a camera, each of which is looked at."""
+"""Number of first frames of a camera that are all measured."""
 PERIOD = 12
 """Interval, in frames, between later measurements."""
 WIDTH = 1
-"""Codes to either side of a plateau's own that belong to it."""
+"""Number of codes on either side that belong to a plateau."""
 WIDE = 2
-"""The same for luma after strong compression."""
+"""Number of codes on either side of a luma plateau after strong compression."""
 NEUTRAL_WIDE = 6.0
 """Largest distance, in codes, of the median pixel of such a plateau; chroma is compressed more strongly than luma."""
 LOPSIDED = 0.7
 """Largest ratio of pixels above a wide plateau to pixels in as many codes below it; a lit surface has a ratio of 1."""
 TOP = 3
-"""Codes to either side of a blurred plateau's own that belong to it."""
+"""Number of codes on either side that belong to a blurred plateau."""
 TOP_SHARE = 0.02
-"""Share of the ball's pixels that it has."""
+"""Smallest share of the ball's pixels on a blurred plateau."""
 TOP_STEEP = 2.0
-"""Ratio of its pixels to those of as many codes before it."""
+"""Smallest ratio of its pixels to those of as many codes below it."""
 STILL = 4
-"""Codes over which it may be spread in time."""
+"""Largest range, in codes, of a plateau over time."""
 MOVED = 0.25
-"""Logarithm of the ratio of the largest gain to the least."""
+"""Smallest logarithm of the ratio between the largest and the smallest gain."""
 MOVED_FRAMES = 4
-"""Frames that must tell."""
+"""Smallest number of usable frames."""
 HELD_HEAP = 2e-3
-"""Share of the whole picture that has codes 254 and 255 where a level that was seen is taken back: sharpening and
-compression throw some there."""
+"""Share of the whole picture with codes 254 and 255 above which an accepted level is withdrawn; sharpening and
+compression cause some such pixels."""
 
 
 class SaturationLevels:
-    """Remembers at which code each channel saturates, frame after frame."""
+    """Estimator of each channel's saturation code over the frames."""
 
     def __init__(self) -> None:
-        """Take every channel to saturate at 255."""
+        """Start with 255 for all channels."""
         self.levels: NDArray[np.float64] = np.full(3, float(FULL))
-        """Code at which each channel saturates, (3,); between two of 8 bits where frames have more."""
+        """Saturation code of each channel, (3,); fractional for frames with more than 8 bits."""
         self._is_full = np.zeros(3, bool)
         self._tops: list[tuple[int, float]] = []
         self._stays: int | None = None
         self._guess: bool | None = None
-        """True if the levels are those of a top that need not stay; None: none was tried, and False: it did not."""
+        """True if the levels are provisional, from a top before any drift; None: none was tried; False: it was
+        withdrawn."""
 
     def observe(
         self,
@@ -120,15 +121,15 @@ class SaturationLevels:
         *,
         bent: bool = False,
     ) -> bool:
-        """Look at one picture; returns whether a level has changed.
+        """Update the levels from one picture; return True if a level has changed.
 
         Args:
             image: uint8 RGB (height, width, 3).
             balls: Centre x, y and radius of each ball, pixels.
-            gain: Of the camera, against its first frame, where that is known to drift.
-            plate: The frame at its full depth, whose codes are read in the place of ``image``'s in balls. Linear light
-                has none.
-            bent: Whether the camera is known to lay a tone curve over what it shows, and its gain is followed.
+            gain: Gain of the camera relative to its first frame, if it drifts.
+            plate: The frame at full depth, whose codes inside balls are used instead of those of ``image``; not for
+                linear plates.
+            bent: True if the camera is known to apply a tone curve, and its gain is estimated.
         """
         if self._is_full.all() and gain == 1.0:
             return False
@@ -164,7 +165,7 @@ class SaturationLevels:
         return bool((before != self.levels).any())
 
     def _may_be_level(self, image: NDArray[np.uint8], top: int) -> bool:
-        """Return whether the code around which luma crowds may be the level before a gain has moved."""
+        """Return True if a concentration of luma at a code may be the level before any change of gain."""
         if self._guess is not None or (self.levels != FULL).any():
             return False
         brighter = float((image[::2, ::2] @ LUMA > top + RINGING // 2).mean())
@@ -172,7 +173,7 @@ class SaturationLevels:
         return bool(self._guess)
 
     def _unmoved(self, top: int | None, gain: float) -> int | None:
-        """Return the code at which luma saturates at any gain; None if still unknown."""
+        """Return the code at which luma saturates for all gains; None if still unknown."""
         if top is None:
             return None
         self._tops = [*self._tops, (top, float(np.log(max(gain, 1e-6))))][-WATCHED:]
@@ -187,10 +188,10 @@ class SaturationLevels:
 
 
 def _exact_level(codes: NDArray[np.float64], level: int) -> float:
-    """Return where a plateau lies whose 8-bit code is known.
+    """Return the exact level of a plateau whose 8-bit code is known.
 
     Args:
-        codes: Of one channel, in steps of 8 bits but not rounded, (n,).
+        codes: Codes of one channel, scaled to 0..255 but not rounded, (n,).
         level: The rounded code.
     """
     on = codes[np.rint(codes) == level]
@@ -198,13 +199,13 @@ def _exact_level(codes: NDArray[np.float64], level: int) -> float:
 
 
 def find_plateau(counts: NDArray[np.int64], steep: float, above: float, width: int = WIDTH) -> int | None:
-    """The code at which a channel saturates, or None where its pixels do not tell.
+    """Return the code at which a channel saturates; None if its pixels show no plateau.
 
     Args:
-        counts: How often each code is seen, (256,).
-        steep: How many times as frequent as the codes before and behind it a plateau must be.
-        above: Share of its pixels that may be higher.
-        width: Codes to either side of its own that belong to it.
+        counts: Number of pixels of each code, (256,).
+        steep: Smallest ratio of the plateau's frequency to that of the codes below and above it.
+        above: Largest share of higher codes, relative to the plateau's pixels.
+        width: Number of codes on either side that belong to the plateau.
     """
     highest = int(np.flatnonzero(counts).max(initial=0))
     if highest < LEAST_LEVEL:
@@ -222,7 +223,7 @@ def find_plateau(counts: NDArray[np.int64], steep: float, above: float, width: i
 
 
 def luma_plateau(codes: NDArray[np.uint8]) -> int | None:
-    """The code at which all channels saturate by a plateau of luma, or None.
+    """Return the code at which all channels saturate, by a plateau of luma; None if there is none.
 
     Args:
         codes: Pixels, (n, 3).
@@ -240,7 +241,9 @@ def luma_plateau(codes: NDArray[np.uint8]) -> int | None:
 
 
 def luma_top(codes: NDArray[np.uint8]) -> int | None:
-    """The code around which the brightest pixels' luma crowds, below the usual level; None where it does not.
+    """Return the code around which the luma of the brightest pixels is concentrated.
+
+    Return None if not, or at the usual level.
 
     Args:
         codes: Pixels, (n, 3).
@@ -255,7 +258,7 @@ def luma_top(codes: NDArray[np.uint8]) -> int | None:
     if counts[level + TOP + 1 :].sum() > 0.5 * on or counts[NEAR_FULL:].sum() > ABOVE * on:
         return None
     in_crowd = np.abs(luma - level) <= TOP
-    # Where a plateau is narrower than the window, several windows hold all of it.
+    # Several windows contain all of a plateau that is narrower than the window.
     middle = int(np.median(luma[in_crowd]))
     off = np.abs(codes[in_crowd].astype(np.float64) - middle)
     return middle if np.median(off, axis=0).max() <= NEUTRAL_WIDE else None
@@ -264,12 +267,12 @@ def luma_top(codes: NDArray[np.uint8]) -> int | None:
 def ball_codes(
     image: NDArray[Any], balls: Sequence[tuple[float, float, float]], inside: float = INSIDE
 ) -> NDArray[Any]:
-    """Codes of the pixels inside balls, (n, 3), of the picture's type.
+    """Return the codes of the pixels inside balls, (n, 3), in the picture's type.
 
     Args:
         image: uint8 or uint16 RGB (height, width, 3).
-        balls: Centre x, y and radius of each, pixels.
-        inside: Share of the radius within which a pixel is taken.
+        balls: Centre x, y and radius of each ball, pixels.
+        inside: Share of the radius within which pixels are used.
     """
     height, width = image.shape[:2]
     found = [np.zeros((0, 3), image.dtype)]
@@ -285,11 +288,11 @@ def ball_codes(
 
 
 def ball_discs(probes: Sequence[Probe], camera: Camera, pose: Pose) -> list[tuple[float, float, float]]:
-    """Return balls in the picture as circles: centre x, y and radius, pixels; none of those behind the camera.
+    """Return balls as circles in the picture: centre x, y and radius in pixels; balls behind the camera are left out.
 
     Args:
         probes: The balls.
-        camera: Its distortion is left out: a rough place is enough.
+        camera: Camera of the picture; its distortion is ignored, because an approximate circle suffices.
         pose: ``camera_from_world``.
     """
     discs = []

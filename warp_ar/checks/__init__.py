@@ -1,1 +1,1 @@
-"""Checks of a set-up, in words."""
+"""Checks of a scene's set-up, with findings as text."""

@@ -1,4 +1,4 @@
-"""Faults that a scene's frames tell of its mirror ball."""
+"""Checks of a scene's mirror ball in its frames."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ from warp_ar.tracking.markers import printed_cells
 Image = NDArray[np.uint8]
 
 SMALL: Final = 14.0
-"""Radius in pixels below which a ball shows too little of the environment."""
+"""Radius in pixels below which a ball resolves too little of the environment."""
 INNER: Final = 0.8
-"""Share of the radius within which the ball is looked at."""
+"""Share of the radius within which the ball's pixels are tested."""
 CLIPPED: Final = 0.2
-"""Share of the ball that may clip: lamps and windows do, walls must not."""
+"""Largest share of clipped pixels in the ball: lamps and windows may clip, walls must not."""
 DULL: Final = 0.10
-"""Standard deviation of the encoded picture inside the ball, over its mean, below which nothing is mirrored."""
+"""Ratio of standard deviation to mean of the codes inside the ball, below which it shows no reflections."""
 RADIUS: Final = 0.03
-"""Share of the radius below which an outline does not contradict it; with three deviations of its own."""
+"""Relative difference of radii that an outline must exceed to contradict the scene, in addition to three standard
+deviations."""
 PLACE: Final = 0.15
-"""Share of the radius by which the centre may be off where the outline shows it."""
+"""Largest error of the centre, relative to the radius, if an outline is visible."""
 SEEN: Final = 0.46
-"""Share of the outline that must be seen where nothing is in front of the ball.
+"""Smallest visible share of the outline of an unoccluded ball.
 
-A ball in the open, whose rim here and there looks like what is behind it, shows 0.50 to 0.97; half hidden it shows
-0.44.
+An unoccluded ball, parts of whose rim resemble the background, has 0.50 to 0.97; a half hidden ball has 0.44.
 """
 SIDES: Final = 6
-"""Frames in which what the ball stands on is looked for in its place."""
+"""Number of frames in which the surface below the ball is searched in the ball's place."""
 LOST: Final = 0.35
-"""Share of the outline below which there is none."""
+"""Visible share of the outline below which there is no ball."""
 
 
 def check_balls(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
-    """Findings about every mirror ball."""
+    """Return the findings for every mirror ball."""
     if not look.views:
         return []
     few = look.views[:: -(-len(look.views) // views)]
@@ -63,14 +63,17 @@ def check_balls(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
 
 
 def inside_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> float:
-    """Standard deviation over mean inside a ball's outline, median over frames: of paper and paint below ``DULL``."""
+    """Return standard deviation over mean inside a ball's outline, median over frames.
+
+    Below ``DULL`` for paper and paint.
+    """
     circles = [(image, rough_circle(camera, pose, probe)) for image, pose in views]
     parts = [disc_contrast(image, circle) for image, circle in circles if circle is not None]
     return float(np.median(parts)) if parts else 0.0
 
 
 def disc_contrast(image: Image, circle: tuple[float, float, float]) -> float:
-    """Standard deviation over mean of a picture within a circle (x, y, radius), pixels; ``DULL`` is its bound."""
+    """Return standard deviation over mean of a picture inside a circle (x, y, radius) in pixels."""
     part = ball_codes(image, [circle], INNER).astype(float)
     return float(part.std() / max(part.mean(), 1.0)) if len(part) else 0.0
 
@@ -113,7 +116,7 @@ def _check_ball(
     off = _compare(probe, solution, label, command)
     others = [other for other in scene.probes if other is not probe]
     seen_ball = dataclasses.replace(probe, center=solution.center, radius=solution.radius)
-    # A ball that explains what is mirrored is right, and the outlines are edges beside its rim.
+    # A ball that explains its mirror image is right; the contradicting outlines are edges near its rim.
     if off and explains_better(views, look.camera, probe, seen_ball, scene.proxies, others):
         off = []
     return [*found, *(off or _check_reflectance(scene, look, views, probe, label))]
@@ -140,7 +143,7 @@ def _check_reflectance(
 
 
 def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> list[Finding]:
-    """The solution against the scene's numbers."""
+    """Return the findings on differences between the solution and the scene's numbers."""
     if not solution.radius_assumed:
         off = solution.radius - probe.radius
         if abs(off) > max(RADIUS * probe.radius, 3 * solution.radius_deviation):
@@ -160,7 +163,7 @@ def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> 
 
 
 def is_in_view(look: Look, pose: Pose, probe: Probe) -> bool:
-    """Return whether a ball's place is in the picture of a camera there."""
+    """Return True if a ball is inside the picture for a camera pose."""
     circle = rough_circle(look.camera, pose, probe)
     return circle is not None and _inside(look, circle)
 
@@ -171,7 +174,7 @@ def _inside(look: Look, circle: tuple[float, float, float]) -> bool:
 
 
 def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, float, float]) -> bool:
-    """Return whether a circle (x, y, radius), pixels, lies within the printed marker or board."""
+    """Return True if a circle (x, y, radius), pixels, is inside the printed marker or board."""
     outline = project(camera, pose.apply(printed_cells(marker)[3]))
     if not np.isfinite(outline).all():
         return False
@@ -182,7 +185,7 @@ def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, 
 def _why_lost(
     marker: Marker, look: Look, views: tuple[tuple[Image, Pose], ...], label: str, contrast: float
 ) -> Finding:
-    """Return what there is instead of the ball: elsewhere, flat paint, or nothing."""
+    """Return the finding on a missing ball: it is elsewhere, is painted, or is absent."""
     command = "check center and radius, and that nothing hides the ball"
     if contrast < 0.5 * DULL:
         text = f"{label}: where the ball should be, the picture is flat: painted over, covered or not there"

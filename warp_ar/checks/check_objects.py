@@ -1,4 +1,4 @@
-"""True if the pictures show the places where virtual objects stand."""
+"""Check that the pictures show the places of virtual objects."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from warp_ar.scene.screen_extents import EMPTY, ball_outline, screen_rects
 Array = npt.NDArray[np.float64]
 
 MOST_POSES: Final = 120
-"""Largest number of a recording's poses that are checked."""
+"""Largest number of a recording's poses that are tested."""
 
 
 def check_objects(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> list[Finding]:
-    """A finding that names the objects which no picture shows; arguments as those of ``find_outside``."""
+    """Return a finding that names the objects outside all pictures; arguments are those of ``find_outside``."""
     found = find_outside(scene, camera, poses)
     if not found:
         return []
@@ -35,14 +35,13 @@ def check_objects(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> list[F
 
 
 def find_outside(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> dict[int, str]:
-    """The objects that no picture shows, by number, and on which side of the first picture they lie.
+    """Return the indices of objects outside all pictures, each with its side relative to the first picture.
 
-    Objects that move, that stand on a marker of their own, or that are there for the light that they emit, may lie
-    outside.
+    Objects that move, have a marker of their own, or serve as lights may be outside.
 
     Args:
         scene: The scene.
-        camera: It took the pictures.
+        camera: Camera of the pictures.
         poses: ``camera_from_world`` of each picture.
     """
     found = {}
@@ -52,7 +51,7 @@ def find_outside(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> dict[in
         try:
             ball = sphere_around(item)
         except SceneError:
-            continue  # the run meets it too, and says it
+            continue  # the run reports the same error
         around = [ball_outline([ball])]
         if poses and all(screen_rects(around, pose, camera) == [EMPTY] for pose in poses):
             found[index] = _side(ball, poses[0], camera)
@@ -60,7 +59,7 @@ def find_outside(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> dict[in
 
 
 def written_poses(scene: Scene) -> list[Pose]:
-    """Some of the poses that a scene without a marker has written down, from all of its frames."""
+    """Return a sample of the given poses of a scene without marker, spread over all frames."""
     if scene.pose is None:
         return []
     poses = scene.pose.poses
@@ -68,7 +67,7 @@ def written_poses(scene: Scene) -> list[Pose]:
 
 
 def sphere_around(item: Object) -> Probe:
-    """A sphere around an object where it stands at first.
+    """Return a sphere around an object at its initial place.
 
     Raises:
         SceneError: Its mesh cannot be read.
@@ -84,13 +83,13 @@ def sphere_around(item: Object) -> Probe:
 
 @functools.lru_cache(maxsize=64)
 def _sphere_of(mesh: Mesh) -> tuple[Array, float]:
-    """Centre (3,) and radius of a sphere around a mesh, in its own lengths."""
+    """Return centre (3,) and radius of a sphere around a mesh, in the mesh's coordinates."""
     low, high = mesh.vertices.min(0).astype(np.float64), mesh.vertices.max(0).astype(np.float64)
     return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
 
 def _reach(item: Object) -> float:
-    """Return how far a shape that is no mesh reaches from its origin, in metres without its scale."""
+    """Return the largest distance of a non-mesh shape from its origin, in metres without its scale."""
     return max(
         item.major_radius + item.minor_radius,
         math.hypot(item.radius, item.length / 2),
@@ -99,7 +98,7 @@ def _reach(item: Object) -> float:
 
 
 def _side(ball: Probe, pose: Pose, camera: Camera) -> str:
-    """On which side of the picture something outside of it lies."""
+    """Return the side of the picture beyond which a ball lies."""
     x, y, z = map(float, pose.apply(np.array(ball.center)))
     if z <= 0.0:
         return "behind the camera"

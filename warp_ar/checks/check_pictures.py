@@ -1,4 +1,4 @@
-"""Faults that a scene's frames tell of its card and camera, by the marker that they show."""
+"""Checks of a scene's card, camera and light in its frames, by the visible marker."""
 
 from __future__ import annotations
 
@@ -27,66 +27,70 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 RARE: Final = 0.6
-"""Share of the frames below which a marker is seen too seldom."""
+"""Share of frames with the marker below which it is visible too rarely."""
 CELL_PIXELS: Final = 3.0
-"""Side in pixels of the smallest cells that are read with certainty."""
+"""Smallest side in pixels of cells that are read reliably."""
 WORST_EDGES: Final = 1.0
-"""Pixels that a print's edges may be off where the pose has them: lens and board as the scene says give 0.1 to 0.4."""
+"""Largest distance in pixels between a print's edges and their places by the pose; a right lens and board give 0.1 to
+0.4."""
 CLIPPED: Final = 250
-"""Code at which white paper is clipped, or about to."""
+"""Code from which white paper counts as clipped."""
 CLIPPED_SHARE: Final = 0.25
-"""Share of the card's white that may clip."""
+"""Largest share of clipped white cells."""
 DARK: Final = 0.04
-"""Linear camera value below which white paper is too dark: its noise is that of the whole picture."""
+"""Linear camera value below which white paper is too dark, so that noise affects the whole picture."""
 CONTRAST: Final = 0.5
-"""Black ink over white paper, linear, above which it is haze, gloss, or another transfer curve."""
+"""Ratio of black ink to white paper, linear, above which there is haze, gloss, or another transfer curve."""
 STEEPEST: Final = 33.0
-"""White paper over black ink, linear, above which no print on plain paper is: that of laser printers is 20 to 30, and
-is read within a tenth (the bundled clips' is 21, read as 19 to 23 in right set-ups). An S-shaped curve, as cameras lay
-over what they show, makes it 35 to 43 by half of smoothstep, and 84 to 103 by all of it."""
+"""Largest ratio of white paper to black ink, linear, of a print on plain paper. Laser prints have 20 to 30, measured
+within a tenth (the bundled clips' has 21, measured as 19 to 23 in right set-ups). An S-shaped tone curve gives 35 to 43
+with half of smoothstep, and 84 to 103 with all of it."""
 SHADOW: Final = 0.45
-"""Logarithm of light across the card that a smooth fall does not explain."""
+"""Logarithm of the light across the card, after a smooth gradient is removed, above which there is a shadow."""
 BLURRED: Final = 6.0
-"""Pixels from 10 to 90 % across a printed edge beyond which the picture is out of focus."""
+"""Width in pixels, from 10 to 90 %, of a printed edge above which the picture is out of focus."""
 SHARP: Final = 0.14
-"""Share of a picture's contrast per pixel of its sharpest edges: in focus 0.4, blurred by 4 pixels 0.08 to 0.13."""
+"""Contrast per pixel of the sharpest edges, relative to the picture's contrast: 0.4 in focus, 0.08 to 0.13 with 4
+pixels of blur."""
 DRIFT: Final = 0.12
-"""Logarithm of exposure by which frames may differ."""
+"""Largest difference between frames of the logarithm of exposure."""
 TINT: Final = 0.06
-"""Change of the card's red or blue against its green that is a drift of the white balance."""
+"""Change of the card's red or blue relative to green from which white balance drifts."""
 FOCAL: Final = 0.02
-"""Share of the focal length below which the card's perspective does not contradict it: 0.015 on right set-ups."""
+"""Relative difference of the focal length that the card's perspective must exceed to contradict it; 0.015 in right
+set-ups."""
 FOCAL_VIEWS: Final = 10
-"""Frames in which it is looked for."""
+"""Number of frames in which the focal length is measured."""
 BOARD_VIEWS: Final = 4
-"""Frames in which a board is looked for where a single marker is expected: a hand or an edge may hide some of it."""
+"""Number of frames in which a board is searched if a single marker is expected, because a hand or the border may hide
+parts."""
 BOARD_MARKERS: Final = 5
-"""Markers of the dictionary in a picture below which no board is looked for."""
+"""Number of the dictionary's markers in a picture below which no board is searched."""
 LEAST_END: Final = 220
-"""Code below which nothing is said: no camera's range ends there (limited range ends at 235, shoulders above), but
-pictures that somebody darkened afterwards do."""
+"""Smallest code for a finding on saturation. No camera's range ends lower (limited range ends at 235, shoulders above),
+but pictures that were darkened afterwards do."""
 ALIKE_ENDS: Final = 2.0
-"""Codes between the channels' ends: a range or a shoulder is that of all three, a tint that was laid over pictures
-afterwards is not. Two must tell; nothing clips in the third, as in blue under warm lamps, or it ends there too."""
+"""Largest difference in codes between the channels' ends: a range or shoulder is common to all three, a tint added to
+pictures later is not. Two channels must show an end. The third must agree or not clip, as blue under warm lamps."""
 LIMITED: Final = (14, 236)
-"""Lowest code that is seen at least, and code at which channels end at most, where limited range (16 to 235) may be
-taken for the full one: within what a codec does to them."""
+"""Lowest code at least, and highest end of the channels at most, at which limited range (16 to 235) may have been taken
+for full range, within a codec's errors."""
 FEW: Final = 1e-3
-"""Share of a picture's pixels that may lie beyond its lowest code and its highest: noise, a codec's ringing."""
+"""Largest share of pixels beyond the lowest or highest code, because of noise and a codec's ringing."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """Frames of a scene, and where the marker is in them."""
+    """Frames of a scene with the poses by their marker."""
 
     camera: Camera
     """Camera at the frames' size."""
     images: tuple[Image, ...]
-    """All frames that were looked at, RGB."""
+    """All frames, RGB."""
     views: tuple[tuple[Image, Pose], ...]
-    """Those with the marker, with ``camera_from_world``."""
+    """Frames with a visible marker, with ``camera_from_world``."""
     errors: tuple[float, ...]
-    """Root mean square distance, pixels, of the print's edges from their places by the pose, for each of those."""
+    """Root mean square distance in pixels of the print's edges from their places by the pose, for each of ``views``."""
     table: NDArray[np.float32]
     """Linear value of each code, (256, 3)."""
 
@@ -94,18 +98,18 @@ class Look:
 def take_look(
     scene: Scene, source: Source, frames: int, every: int = 1, tell: Callable[[str], object] | None = None
 ) -> Look:
-    """Look at some of a source's first frames; of alternating exposures the longest.
+    """Read some of a source's first frames and track the marker; of alternating exposures, use the longest.
 
     Args:
-        scene: Its marker is looked for, by its camera.
-        source: Gives the frames.
-        frames: How many are taken from it.
-        every: Look at each so many of them.
-        tell: Told, for people, which frame is looked at.
+        scene: Scene with the marker and the camera.
+        source: Source of the frames.
+        frames: Number of frames to read.
+        every: Stride of the frames that are used.
+        tell: Function that receives a progress text for users.
 
     Raises:
         SceneError: The camera was calibrated for another aspect ratio.
-        SourceError: The source breaks.
+        SourceError: The source fails.
     """
     shown = (
         frame for frame in itertools.islice(source, frames) if frame.exposure_time in (None, *source.exposures[:1])
@@ -123,11 +127,11 @@ def take_look(
 
 
 def look_at(marker: Marker, camera: Camera, frames: Iterable[tuple[Image, float]]) -> Look:
-    """Look for the marker in frames.
+    """Track the marker in frames.
 
     Args:
         marker: The printed card.
-        camera: It took the frames.
+        camera: Camera of the frames.
         frames: 8-bit RGB of the camera's size, each with its time in seconds.
     """
     tracker = Tracker(marker, camera, steady=False)
@@ -142,12 +146,12 @@ def look_at(marker: Marker, camera: Camera, frames: Iterable[tuple[Image, float]
 
 
 def check_pictures(scene: Scene, look: Look) -> list[Finding]:
-    """Findings about card and camera."""
+    """Return the findings on card and camera."""
     if not look.images:
         return [Finding("source.empty", "the source has no frames", "check [source]")]
     if not look.views:
         return [why_unseen(scene.marker, look)]
-    # One of a board's markers taken for a single one gives a wrong scale: all else follows from that.
+    # A board's marker taken for a single one gives a wrong scale, from which all other findings follow.
     views = [image for image, _ in look.views]
     if (board := board_instead(scene.marker, views[:: -(-len(views) // BOARD_VIEWS)])) is not None:
         return [board]
@@ -157,7 +161,7 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
 
 
 def _check_card(marker: Marker, look: Look) -> Iterator[Finding]:
-    """Yield findings about the marker, and about camera and light by it."""
+    """Yield findings on the marker, and on camera and light measured by it."""
     share = len(look.views) / len(look.images)
     if share < RARE:
         text = f"the marker is seen in {share:.0%} of {len(look.images)} frames"
@@ -179,7 +183,7 @@ def _check_card(marker: Marker, look: Look) -> Iterator[Finding]:
 
 
 def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
-    """The finding that pictures show a marker of the scene twice, of which either may be followed."""
+    """Return the finding that pictures show a marker of the scene twice, so that either may be tracked."""
     own = set(pattern_of(marker).markers)
     detector = MarkerDetector(marker.dictionary)
     for image in (images[0], images[-1]):
@@ -192,13 +196,13 @@ def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
 
 
 def _marker_side(marker: Marker, camera: Camera, pose: Pose) -> float:
-    """Mean side in pixels of a marker, the median of a board's."""
+    """Return the side in pixels of a marker, or the median side of a board's markers."""
     quads = [project(camera, pose.apply(corners)) for corners in pattern_of(marker).markers.values()]
     return float(np.median([np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean() for quad in quads]))
 
 
 def why_unseen(marker: Marker, look: Look) -> Finding:
-    """Return what the pictures show instead of the marker."""
+    """Return the finding on a marker that is not visible, with what the pictures show instead."""
     image = look.images[len(look.images) // 2]
     wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
     ids = set(pattern_of(marker).markers)
@@ -231,20 +235,20 @@ def why_unseen(marker: Marker, look: Look) -> Finding:
 
 
 def board_instead(marker: Marker, images: Sequence[Image]) -> Finding | None:
-    """The finding that pictures show a board of which the scene expects one marker, taken to be of another size.
+    """Return the finding that pictures show a board although the scene has a single marker of another size.
 
     Args:
-        marker: What the scene expects.
+        marker: The scene's marker.
         images: RGB pictures, uint8 (h, w, 3).
 
     Returns:
-        None where the scene expects a board, and where no picture shows one with the marker's number.
+        The finding; None if the scene has a board, or no picture shows a board with the marker's number.
     """
     if marker.board is not None:
         return None
     detector = MarkerDetector(marker.dictionary)
     for image in images:
-        # Reading one dictionary takes milliseconds, recognising a layout reads all of them.
+        # Detection with one dictionary takes milliseconds, recognising a layout tries all of them.
         if len(detector.detect(_gray(image))) < BOARD_MARKERS:
             continue
         seen = recognise_board(image)
@@ -265,7 +269,7 @@ def board_instead(marker: Marker, images: Sequence[Image]) -> Finding | None:
 
 
 def _is_blurred(image: Image) -> bool:
-    """Return whether nothing in a picture that has contrast has a sharp edge."""
+    """Return True if no structure in a picture has a sharp edge."""
     gray = cv2.medianBlur(_gray(image), 3).astype(np.float32)
     low, high = np.percentile(gray, (1, 99))
     slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray, cv2.CV_32F, 0, 1, scale=1 / 8))
@@ -278,32 +282,33 @@ def _gray(image: Image) -> Image:
 
 @dataclasses.dataclass(frozen=True)
 class FocalFit:
-    """Focal length under which the print's edges fit best."""
+    """Focal length for which the print's edges fit best."""
 
     ratio: float
-    """The focal length over the camera's own."""
+    """Ratio of the focal length to the camera's own."""
     deviation: float
     """Standard error of the ratio."""
     views: int
-    """Frames that tell it."""
+    """Number of frames used."""
     gain: float
-    """Squared residuals under the camera's own focal length, over the least."""
+    """Ratio of squared residuals for the camera's focal length to the smallest ones."""
 
 
 def measure_focal(marker: Marker, look: Look) -> FocalFit | None:
-    """Find the focal length under which the print's edges fit best, each frame posed anew for each candidate.
+    """Return the focal length for which the print's edges fit best, with poses fitted again for each candidate.
 
-    The squared residuals are a parabola about their least; leaving out one frame after the other says how sure it is.
+    The squared residuals are approximated by a parabola; leaving out one frame after the other gives the standard
+    error.
 
     Returns:
-        None if fewer than four frames tell it.
+        The fit; None if fewer than four frames can be used.
     """
     images = [image for image, _ in look.views[:: -(-len(look.views) // FOCAL_VIEWS) or 1]]
     if len(images) < 4:
         return None
     tracker = Tracker(marker, look.camera, steady=False)
     pictures = [(image, tracker.detect(image)) for image in images]
-    # Where it lies is looked for in few frames, and measured in all around there.
+    # The minimum is located with few frames, and then measured with all of them.
     rough = np.exp(np.linspace(-0.3, 0.3, 9))
     few = [_squared_errors(marker, look.camera, pictures[:: -(-len(pictures) // 3)], factor).sum() for factor in rough]
     factors = rough[int(np.argmin(few))] * np.array([0.94, 0.97, 1.0, 1.03, 1.06])
@@ -321,7 +326,7 @@ def measure_focal(marker: Marker, look: Look) -> FocalFit | None:
 
 def _check_focal(marker: Marker, look: Look) -> Iterator[Finding]:
     fit = measure_focal(marker, look)
-    # Views from one side alone leave the least so flat that anything moves it.
+    # With views from one side only, the minimum is too flat.
     if fit is None or abs(fit.ratio - 1) < max(FOCAL, 3 * fit.deviation) or fit.gain < 1.02:
         return
     given = look.camera.fx
@@ -335,20 +340,23 @@ def _check_focal(marker: Marker, look: Look) -> Iterator[Finding]:
 def _squared_errors(
     marker: Marker, camera: Camera, pictures: Sequence[tuple[Image, list[Detection]]], factor: float
 ) -> Array:
-    """Mean squared distance of the print's edges in each picture, pixels squared; infinite where it is not seen."""
+    """Return the mean squared distance of the print's edges in each picture, pixels squared.
+
+    Infinite if not visible.
+    """
     tracker = Tracker(marker, dataclasses.replace(camera, fx=camera.fx * factor, fy=camera.fy * factor), steady=False)
     return np.array([tracker.error_of(image, found) ** 2 for image, found in pictures])
 
 
 def _lowest(factors: Array, totals: Array) -> float:
-    """Return where the parabola through the totals is lowest."""
+    """Return the minimum of the parabola through the totals."""
     curve, slope, _ = np.polyfit(factors, totals, 2)
     lowest = -slope / (2 * curve) if curve > 0 else factors[np.argmin(totals)]
     return float(np.clip(lowest, factors[0], factors[-1]))
 
 
 def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[Array, Array, Array]:
-    """White cells' places (n, 3), codes (n, 3), and black cells' codes (m, 3), of those in the picture."""
+    """Return white cells' positions (n, 3) and codes (n, 3), and black cells' codes (m, 3), of cells in the picture."""
     cells, white, _, _ = printed_cells(marker)
     pixels = project(look.camera, pose.apply(cells))
     inside = ((pixels >= 1) & (pixels <= (look.camera.width - 2, look.camera.height - 2))).all(1)
@@ -358,7 +366,7 @@ def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[
 
 
 def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> Iterator[Finding]:
-    """Return whether the card's white can be measured, and whether it stays."""
+    """Yield findings on the card's white (clipped, dark, shadowed) and on its drift."""
     clipped, dark, ratios, uneven, whites = [], [], [], [], []
     for image, pose in views:
         places, white, black = _cell_values(marker, look, image, pose)
@@ -374,7 +382,7 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
         log = np.log(np.maximum(linear.mean(1), 1e-4))
         design = np.column_stack([np.ones(len(places)), places[:, :2]])
         rest = log - design @ np.linalg.lstsq(design, log, rcond=None)[0]
-        # A shadow's edge leaves two groups: cells that a print's noise or a blurred edge darken are few.
+        # A shadow's edge splits the cells into two groups; cells darkened by print noise or blurred edges are few.
         uneven.append(float(np.percentile(rest, 85) - np.percentile(rest, 15)))
     if not whites:
         return
@@ -403,7 +411,7 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
 
 
 def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array) -> Iterator[Finding]:
-    """Drifts of the camera's own: it changes all of the picture alike; a lamp changes every side differently."""
+    """Yield findings on drift: the camera changes the whole picture equally, a lamp changes each side differently."""
     if len(whites) < 2:
         return
     first, last = views[0][0], views[-1][0]
@@ -423,7 +431,7 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
     colour = ratio[:, [0, 2]] - ratio[:, 1:2]
     shift, width = np.median(colour, axis=0), np.percentile(colour, 80, axis=0) - np.percentile(colour, 20, axis=0)
     k = int(np.argmax(np.abs(shift)))
-    # A lamp that goes changes level and colour together; a camera's balance hardly changes the level.
+    # Switching off a lamp changes brightness and colour together; automatic white balance hardly changes brightness.
     alike = width[k] < 0.75 * abs(shift[k]) and abs(change) < 0.4
     if abs(shift[k]) > TINT and abs(tints[-1, k] - tints[0, k]) > TINT and alike:
         text = f"the white balance drifts: {'red' if k == 0 else 'blue'} by a factor of {math.exp(shift[k]):.2f}"
@@ -431,7 +439,7 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
 
 
 def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> Iterator[Finding]:
-    """Width of printed edges in the picture."""
+    """Yield the finding on the width of printed edges in the picture."""
     pattern, widths = pattern_of(marker), []
     taps = np.linspace(-8, 8, 65)
     for image, pose in views:
@@ -459,13 +467,13 @@ def _rise(profile: Array, taps: Any) -> float:
 
 
 def check_saturation(scene: Scene, look: Look) -> list[Finding]:
-    """The finding that the lamps in a mirror ball, or what else clips there, end below the highest code.
+    """Return the finding that clipped light in a mirror ball has codes below the highest one.
 
-    Nothing is found where no ball shows anything that clips.
+    Nothing is found if no ball shows clipped light.
 
     Args:
-        scene: With its balls where the scene has them.
-        look: What its frames show.
+        scene: Scene with its balls.
+        look: Frames of the scene.
     """
     seen = SaturationLevels()
     for image, pose in look.views:
@@ -487,6 +495,6 @@ def check_saturation(scene: Scene, look: Look) -> list[Finding]:
 
 
 def _lowest_code(images: Sequence[NDArray[np.uint8]]) -> float:
-    """The lowest code of all but ``FEW`` of the pixels, by the darkest channel of some pictures."""
+    """Return the lowest code in the darkest channel of some pictures, ignoring the share ``FEW`` of the pixels."""
     few = images[:: -(-len(images) // 4)]
     return min(float(np.quantile(image[::2, ::2].min(axis=2), FEW)) for image in few)

@@ -1,8 +1,9 @@
-"""True if the card was printed at true scale: by the paper that it is printed on, whose size is known.
+"""Check of the printed card's scale by the paper around it, whose size is known.
 
-A print at 97 % looks like everything else at 103 %: nothing on it tells. Its paper does. In units of the print, A4 at
-97 % is 216 mm wide, which is nearly Letter's width, and its upper edge is 179 mm from the board's middle, which is not.
-So the left, right and upper edge of the sheet are looked for where the pose has them, along lines across the margin.
+A print at 97 % looks the same as everything else at 103 %: the print itself cannot show the error, but the paper can.
+In units of the print, A4 at 97 % is 216 mm wide, which is nearly the width of Letter. However, its upper edge is 179 mm
+from the board's centre, unlike Letter's. The left, right and upper edges of the sheet are therefore searched near their
+expected places, along lines across the margin.
 """
 
 from __future__ import annotations
@@ -23,29 +24,29 @@ from warp_ar.tracking.card_layout import SHEET, board_top
 Image = NDArray[np.uint8]
 
 OFF: Final = 0.012
-"""Share by which a print's scale may be off: printers feed paper as well as that."""
+"""Largest relative error of a print's scale; printers feed paper with as much error."""
 SIDES: Final = (0.096, 0.122)
-"""Metres from the board's middle between which the left and right edge of A4 or Letter lie, at 90 to 110 %."""
+"""Range of distances in metres from the board's centre of the left and right edge of A4 or Letter, at 90 to 110 %."""
 UPPER: Final = (0.158, 0.200)
-"""The same of the upper edge."""
+"""Range of distances in metres of the upper edge."""
 STEP: Final = 0.0005
-"""Metres between samples across an edge."""
+"""Distance in metres between samples across an edge."""
 LINES: Final = 24
-"""Lines across each edge."""
+"""Number of lines across each edge."""
 DARKER: Final = 14.0
-"""Codes by which what lies beside the paper differs from it at least."""
+"""Smallest difference in codes between the paper and its surroundings."""
 ALIKE: Final = 0.0012
-"""Metres within which the lines across one edge must agree."""
+"""Largest spread in metres of the lines across one edge."""
 AGREE: Final = 0.5
-"""Share of the lines that must."""
+"""Share of the lines that must agree."""
 SAME: Final = 0.003
-"""Metres by which the upper edge may be off where a paper and a scale have it."""
+"""Largest error in metres of the upper edge for a paper and a scale."""
 FEWEST: Final = 2
-"""Views in which the sheet must be seen."""
+"""Smallest number of views that show the sheet."""
 
 
 def card_scale(marker: Marker) -> float | None:
-    """Lengths of a marker over those of the printed card; None where it is not that card."""
+    """Return the ratio of a marker's lengths to those of the printed card; None if it is not that card."""
     board, made = marker.board, SHEET.board
     assert isinstance(made, CharucoBoard)
     if not isinstance(board, CharucoBoard) or marker.dictionary != SHEET.dictionary:
@@ -57,7 +58,7 @@ def card_scale(marker: Marker) -> float | None:
 
 
 def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
-    """A finding where the paper says that the print's scale is not what the marker's lengths say."""
+    """Return a finding if the paper contradicts the scale of the marker's lengths."""
     told = card_scale(marker)
     if told is None:
         return []
@@ -68,9 +69,9 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
     best: tuple[float, float, str] | None = None
     for paper in ("a4", "letter"):
         paper_width, height = (length / 1e3 for length in PAPERS[paper])
-        # Metres of the scene over those of the world: what is printed larger is taken for metres that are smaller.
+        # Scene metres per world metre: with a larger print, scene metres are too short.
         factor = paper_width / width
-        # Printers scale about the middle of the page.
+        # Printers scale about the centre of the page.
         printed = factor * told
         top = (height / 2 - printed * (height / 2 - board_top(height))) / factor
         if best is None or abs(top - upper) < best[0]:
@@ -93,10 +94,10 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
 
 
 def _find_sheet(image: Image, camera: Camera, pose: Pose) -> tuple[float, float] | None:
-    """Width of the sheet, and how far its upper edge is from the board's middle, metres; None where not seen."""
+    """Return the sheet's width and its upper edge's distance from the board's centre, metres; None if not visible."""
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
     along = np.linspace(-0.05, 0.15, LINES)
-    # Not where the ball stands, nor behind it.
+    # Not where the ball or its background may be.
     beside = np.concatenate([np.linspace(-0.09, -0.05, LINES // 2), np.linspace(0.05, 0.09, LINES // 2)])
     sides = [_find_edge(gray, camera, pose, SIDES, [((sign, 0.0), (0.0, y)) for y in along]) for sign in (-1.0, 1.0)]
     upper = _find_edge(gray, camera, pose, UPPER, [((0.0, 1.0), (x, 0.0)) for x in beside])
@@ -112,7 +113,7 @@ def _find_edge(
     window: tuple[float, float],
     lines: Sequence[tuple[tuple[float, float], tuple[float, float]]],
 ) -> float | None:
-    """Return how far along lines, each with a direction and a start, the paper ends; None where they do not agree."""
+    """Return the distance to the paper's edge along lines, each with direction and start; None if they disagree."""
     far = np.arange(*window, STEP)
     found = []
     for way, start in lines:
@@ -121,7 +122,7 @@ def _find_edge(
         if not ((pixels >= 1) & (pixels <= (gray.shape[1] - 2, gray.shape[0] - 2))).all():
             continue
         values = cv2.remap(gray, pixels.astype(np.float32)[:, None], None, cv2.INTER_LINEAR).ravel()
-        # The paper is bright up to its edge, and what follows is not.
+        # The paper is bright up to its edge, and its surroundings are not.
         falls = values[:-4] - values[4:]
         k = int(falls.argmax())
         if falls[k] < DARKER or values[: k + 1].min() < values[k + 4] + 0.5 * DARKER:

@@ -1,7 +1,8 @@
-"""Modelled walls and boxes beside the edges that the picture shows of them.
+"""Check of modelled walls and boxes against edges in the picture.
 
-Every visible edge of a shape is sampled; a sample is met where the picture has a step in colour across the edge. A
-shape that few samples meet is tried at places around its own: if many more meet it at one of them, it stands there.
+Every visible edge of a shape is sampled; a sample matches if the picture has a colour step across the edge there. A
+shape with few matches is also tested at displaced positions. If many more samples match at one of them, the shape
+stands there.
 """
 
 from __future__ import annotations
@@ -23,28 +24,28 @@ Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
 FARTHEST: Final = 0.03
-"""Distance in metres to which other places are tried, along x and y."""
+"""Largest displacement in metres, along x and y."""
 STEPS: Final = (0.003, 0.001)
-"""Distances in metres between places, first around the shape and then around the best place."""
+"""Distances in metres between displacements, first around the shape and then around the best one."""
 PIXELS: Final = 5.0
-"""Pixels by which a corner must be off: a box that is right is off by 0.6."""
+"""Smallest displacement of a corner in pixels for a finding; a right box has 0.6."""
 ON: Final = 0.6
-"""Share of samples that are met from which on a shape is right."""
+"""Share of matching samples from which a shape is right."""
 BETTER: Final = 0.15
-"""Share by which more samples must be met elsewhere."""
+"""Smallest increase of that share at a displaced position."""
 FEWEST: Final = 2
-"""Views that must agree, or all where there are fewer."""
+"""Number of views that must agree, or all if there are fewer."""
 STEP: Final = 6.0
-"""Codes per pixel of a step in colour: more than noise and wood have; less in dark pictures."""
+"""Smallest colour step in codes per pixel, above noise and wood grain; lower in dark pictures."""
 BRIGHT: Final = 110.0
-"""Mean code of a picture from which on ``STEP`` holds."""
+"""Mean code of a picture from which ``STEP`` applies."""
 FAINTEST: Final = 2.0
-"""Codes per pixel of a step in the darkest picture: four standard deviations of a camera's noise."""
+"""Smallest colour step in codes per pixel in the darkest picture: four standard deviations of a camera's noise."""
 _FACES: Final = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
 def check_proxies(scene: Scene, camera: Camera, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
-    """Return findings about walls, and boxes that stand on the desk, whose edges the picture has elsewhere."""
+    """Return findings on walls and standing boxes whose edges are elsewhere in the picture."""
     found = []
     for index, proxy in enumerate(scene.proxies):
         kind, shape = _numbers(proxy)
@@ -66,7 +67,7 @@ def check_proxies(scene: Scene, camera: Camera, views: Sequence[tuple[Image, Pos
 
 
 def _numbers(proxy: Proxy) -> tuple[str | None, Array]:
-    """Return kind and numbers, as ``corners_of`` takes them, of a wall or a box that stands on the desk."""
+    """Return kind and numbers, in the form of ``corners_of``, of a wall or of a box standing on the receiver."""
     turn = math.radians(proxy.rotate[2])
     x, y, z = proxy.at
     if proxy.shape == "box" and proxy.rotate[:2] == (0.0, 0.0) and abs(z - proxy.size[2] / 2) < 0.1 * proxy.size[2]:
@@ -79,9 +80,9 @@ def _numbers(proxy: Proxy) -> tuple[str | None, Array]:
 def _elsewhere(
     image: Image, camera: Camera, pose: Pose, kind: str, shape: Array
 ) -> tuple[tuple[float, float], bool] | None:
-    """Return the offset in metres at which most edges meet a shape, and if it is right there rather than where it is.
+    """Return the displacement in metres with the most matches, and True if the shape fits only there.
 
-    None where the shape is not whole in the picture: what is left of an outline that is cut off fits anywhere.
+    None if the shape is not entirely in the picture, because a cut-off outline fits anywhere.
     """
     corners = corners_of(kind, shape)
     eye = -pose.rotation.T @ pose.translation
@@ -111,7 +112,7 @@ def _elsewhere(
 
 
 def _edges(kind: str, corners: Array, eye: Array) -> list[tuple[int, int]]:
-    """Return the edges that the camera sees: those of faces that are turned toward it."""
+    """Return the edges visible to the camera: those of faces turned toward it."""
     faces = [(0, 1, 2, 3)]
     if kind == "box":
         middle, centers = corners.mean(0), [corners[list(face)].mean(0) for face in _FACES]
@@ -122,16 +123,16 @@ def _edges(kind: str, corners: Array, eye: Array) -> list[tuple[int, int]]:
 
 
 class _Steps:
-    """Steps in colour of a picture."""
+    """Colour steps of a picture."""
 
     def __init__(self, image: Image) -> None:
         smooth = cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32)
-        # Scharr's kernel weighs 32 codes per pixel.
+        # Scharr's kernel has a weight of 32 per code and pixel.
         self._slopes = [cv2.Scharr(smooth, cv2.CV_32F, *axes) / 32.0 for axes in ((1, 0), (0, 1))]
         self._least = max(STEP * min(float(image.mean()) / BRIGHT, 1.0), FAINTEST)
 
     def share(self, start: Array, end: Array) -> float:
-        """Return the share of a straight edge between two pixels across which the picture has a step."""
+        """Return the share of a straight edge between two pixels across which the picture has a colour step."""
         length = float(np.linalg.norm(end - start))
         if not length > 0.0:
             return 0.0

@@ -1,4 +1,4 @@
-"""Faults that a scene's numbers alone tell: units, a ball that is sunk into the table, a lens that no camera has."""
+"""Checks of a scene's numbers without pictures: units, a ball below the table, an implausible lens."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from warp_ar.checks.finding import Finding
 from warp_ar.scene import Camera, CharucoBoard, EmissiveMaterial, Light, Object, Probe, Proxy, Scene
 
 LARGEST_BALL: Final = 0.3
-"""Metres: no mirror ball on a desk has a larger radius, gazing globes included."""
+"""Largest radius in metres of a mirror ball, including gazing globes."""
 SMALLEST_BALL: Final = 0.003
-"""Metres: a smaller ball is a few pixels wide."""
+"""Smallest radius in metres; a smaller ball covers only a few pixels."""
 LARGEST_CARD: Final = 1.5
-"""Metres: the side of the largest print."""
+"""Largest side of a print, metres."""
 SMALLEST_CARD: Final = 0.008
-"""Metres: the side of the smallest print that a camera reads."""
+"""Smallest side in metres of a print that a camera can read."""
 FARTHEST: Final = 5.0
-"""Metres from the card to anything on a desk."""
+"""Largest distance in metres from the card."""
 FIELDS: Final = (12.0, 140.0)
-"""Degrees: horizontal fields of view of cameras with a pinhole's picture."""
+"""Range in degrees of horizontal fields of view of pinhole cameras."""
 SQUARE: Final = 0.02
-"""Share by which a pixel's sides differ at most."""
+"""Largest relative difference of a pixel's sides."""
 CENTRAL: Final = 0.15
-"""Share of the picture's width by which a principal point is off its middle at most."""
+"""Largest distance of the principal point from the picture's centre, relative to the width."""
 SUNK: Final = 0.0015
-"""Metres: the card's thickness and a ruler's error, by which a ball may seem to be in the table."""
+"""Depth in metres by which a ball may be below the table: the card's thickness and a ruler's error."""
 
 
 def check_scene(scene: Scene) -> list[Finding]:
-    """Findings that need no picture."""
+    """Return the findings that need no picture."""
     found = [*_check_card(scene), *_check_camera(scene.camera)]
     for index, probe in enumerate(scene.probes):
         label = "[probe]" if len(scene.probes) == 1 else f"[[probe]] {index}"
@@ -43,7 +43,7 @@ def check_scene(scene: Scene) -> list[Finding]:
 
 
 def _check_items(scene: Scene) -> Iterator[Finding]:
-    """Yield findings about objects, lights and proxies."""
+    """Yield findings on objects, lights and proxies."""
     emits = any(isinstance(item.material, EmissiveMaterial) for item in scene.objects)
     if scene.objects and not (scene.probes or scene.lights or scene.captured or emits):
         text = "the scene has neither a mirror ball nor a light nor captured light: its objects are black"
@@ -63,7 +63,7 @@ def _check_items(scene: Scene) -> Iterator[Finding]:
 
 
 def _in_metres(value: float, largest: float) -> str:
-    """A guess at the unit that was meant."""
+    """Return a guess at the intended unit, as text."""
     for name, factor in (("centimetres", 0.01), ("millimetres", 0.001)):
         if value * factor <= largest:
             return f"; {value:g} {name} are {value * factor:g} m"

@@ -1,4 +1,4 @@
-"""All checks of a set-up, and their quick half."""
+"""All checks of a set-up, and a quick subset."""
 
 from __future__ import annotations
 
@@ -20,30 +20,31 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.sources.sources import open_source, source_of
 
 FRAMES: Final = 120
-"""Frames that are looked at."""
+"""Number of frames read by the full check."""
 FEW_VIEWS: Final = 5
-"""Views in which paper and modelled shapes are looked for."""
+"""Number of views in which paper and modelled shapes are searched."""
 QUICK_FRAMES: Final = 12
-"""Frames that the quick half looks at."""
+"""Number of frames read by the quick check."""
 SPREAD: Final = 96
-"""Frames of ``PIXELS`` over which these are spread: drifts, and views from several sides, take seconds."""
+"""Number of frames, at the size ``PIXELS``, over which the quick check's frames are spread, to include drift and
+several views."""
 _NOT_LOOKED: Final = ("source.", "units.", "marker.", "picture.", "camera.aspect", "ball.unfound", "ball.outside")
-"""Beginnings of findings after which a ball was not looked for, or one of several not seen."""
+"""Prefixes of findings after which a ball was not searched, or after which one of several balls was not visible."""
 PIXELS: Final = 640 * 480
-"""Pixels of a picture above which fewer frames are read, for the same total."""
+"""Number of pixels of a picture above which fewer frames are read, for the same total."""
 
 
 def check_up(scene: Scene, source: str | int | Path | None, *, quick: bool = False) -> list[Finding]:
-    """Return what is wrong with a set-up, the worst first; arguments as those of `check_and_look`."""
+    """Return the findings on a set-up, the worst first; arguments are those of `check_and_look`."""
     return check_and_look(scene, source, quick=quick)[0]
 
 
 def quick_check(scene: Scene, given: str | int | Path | None) -> tuple[list[Finding], bool]:
-    """Look at a set-up's first frames, if they were recorded, for about a second.
+    """Check the first frames of a recorded source in about a second.
 
     Args:
         scene: The scene.
-        given: Its frames, unless they are the scene's own.
+        given: Source of frames instead of the scene's own, or None.
 
     Returns:
         The findings, the worst first, and True if a frame shows every mirror ball of the scene, which has one.
@@ -63,17 +64,17 @@ def check_and_look(
     quick: bool = False,
     tell: Callable[[str], object] | None = None,
 ) -> tuple[list[Finding], Look | None]:
-    """Return what is wrong with a set-up, the worst first, and what its frames show: they need not be read twice.
+    """Return the findings on a set-up, the worst first, and the frames that were read.
 
     Args:
         scene: The scene.
-        source: The frames; None: look at the scene's numbers alone.
-        frames: How many to look at.
-        quick: Look at a few only, which takes about a second.
-        tell: Told, for people, what is looked at: all of it takes seconds.
+        source: Source of the frames; None: check the scene's numbers only.
+        frames: Number of frames to read.
+        quick: True to read only a few frames, which takes about a second.
+        tell: Function that receives a progress text for users; the full check takes seconds.
 
     Returns:
-        The findings, and None in the look's place where no frames were read.
+        The findings, and the frames or None if none were read.
     """
     unread = []
     if source is not None:
@@ -91,7 +92,7 @@ def check_and_look(
 
 
 def _read(scene: Scene, source: str | int | Path, frames: int | None, tell: Callable[[str], object] | None) -> Look:
-    """Frames of a source; for None as many as are looked at in a second, from all over its beginning."""
+    """Return frames of a source; for ``frames`` None, as many as can be read in a second, spread over its beginning."""
     own = scene.source
     exposures = own.exposures or () if own is not None else ()
     with open_source(source, exposures=exposures) as opened:
@@ -105,48 +106,48 @@ def _read(scene: Scene, source: str | int | Path, frames: int | None, tell: Call
 
 
 def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
-    """Return what is wrong with a set-up whose frames were looked at already, the worst first.
+    """Return the findings on a set-up whose frames were read before, the worst first.
 
     Args:
         scene: The scene.
-        look: What its frames show.
-        views: In how many frames the ball is looked for, each about half a second.
+        look: Frames of the scene.
+        views: Number of frames in which the ball is searched; each takes about half a second.
     """
     before = check_scene(scene)
     return worst_first([*before, *_check_frames(scene, look, views, {finding.name for finding in before})])
 
 
 def _check_frames(scene: Scene, look: Look, views: int, told: set[str]) -> list[Finding]:
-    """Return what frames tell beside what the scene's own numbers have told."""
+    """Return the findings by frames, without those that the scene's own numbers have given."""
     if not scene.has_marker and look.images:
-        # Its poses are written down: no print is there to tell camera, light and ball by.
+        # The poses are given: without a print, camera, light and ball cannot be checked.
         return check_objects(scene, look.camera, written_poses(scene))
     found = check_pictures(scene, look)
     if any(finding.name in ("marker.board", "marker.twice") for finding in found):
-        return found  # poses by another marker say nothing about prints, proxies and balls
+        return found  # poses by another marker allow no conclusion on prints, proxies and balls
     few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
     found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
-    # Where the scene's own numbers cannot be, a picture says nothing more about them.
+    # Where the scene's numbers are impossible, pictures add no information.
     if any(name.startswith("units.") for name in told):
         return found
     found += check_objects(scene, look.camera, [pose for _, pose in look.views])
     balls = check_balls(scene, look, views)
     if not any(finding.name in ("ball.outside", "ball.unfound") for finding in balls):
         found += check_saturation(scene, look)
-    # What is mirrored is darker than what is seen directly: another curve changes their ratio.
+    # The mirror image is darker than the direct view: another curve changes their ratio.
     known = {"ball.reflectance"} if {"camera.response", "card.contrast"} & {one.name for one in found} else set()
     known |= {"ball.place"} if "ball.sunk" in told else set()
     return [*found, *(finding for finding in balls if finding.name not in known)]
 
 
 def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]) -> bool:
-    """Return whether any of some posed RGB frames shows any of the scene's mirror balls."""
+    """Return True if any of some posed RGB frames shows any of the scene's mirror balls."""
     views = list(views)
     for probe in scene.probes:
         ground = standing_ground(probe, scene.proxies)
         if ground is not None and ground_is_seen(views, camera, probe, ground):
-            continue  # edges of what lies there may look like a rim
-        # Frame by frame, up to the first that does: looking takes a third of a second.
+            continue  # edges of the visible surface may resemble a rim
+        # Frames are tested up to the first success: each takes a third of a second.
         outlines = (find_outline(view, camera, probe) for view in views)
         if any(outline is not None and outline.support > LOST for outline in outlines):
             return True
@@ -154,11 +155,11 @@ def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]
 
 
 def are_balls_missing(scene: Scene, given: str | int | Path | None) -> bool:
-    """Return whether the first frames of a recording show where the mirror balls should be, and none is there.
+    """Return True if the first frames of a recording show the places of the mirror balls, but no ball.
 
     Args:
         scene: The scene.
-        given: Its frames, unless they are the scene's own.
+        given: Source of frames instead of the scene's own, or None.
 
     Raises:
         SceneError: The camera was calibrated for another aspect ratio.

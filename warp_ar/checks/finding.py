@@ -1,4 +1,4 @@
-"""Faults of a set-up in words: what was found, what it spoils, what to do."""
+"""Findings on a set-up as text: the fault, its effect, and the remedy."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """A fault of the set-up, or a guess."""
+    """Fault of a set-up, or an assumed value."""
 
     name: str
-    """Name of the check that found it, such as ``probe.radius``."""
+    """Name of the check, such as ``probe.radius``."""
     text: str
-    """Description of what was found, with the value and what would be right."""
+    """Description of the fault, with the value and allowed values."""
     remedy: str
-    """Remedy: a command, or a key of the scene file."""
+    """Command, or key of the scene file, that removes the fault."""
 
     def remedy_for(self, scene: str | None) -> str:
-        """Return what to do, with the scene's own name where a command takes it; None: it is not written into."""
+        """Return the remedy with the scene's name inserted in commands; with None, commands keep a placeholder."""
         if scene is None:
             return self.remedy
         named = self.remedy.replace("calibrate camera PICTURES", f"calibrate camera PICTURES --write {scene}")
@@ -30,12 +30,12 @@ class Finding:
 
     @property
     def error(self) -> float:
-        """Mean FLIP of a picture lit with this fault against one lit without, 0 to 1; 1 where nothing can be lit."""
+        """Mean FLIP between pictures lit with and without this fault, 0 to 1; 1 if lighting is impossible."""
         return float(fault_errors().get(self.name, {"error": 0.0})["error"])
 
     @property
     def cost(self) -> str:
-        """Return what it spoils, in words."""
+        """Return the effect of the fault, as text."""
         entry = fault_errors().get(self.name)
         if entry is None:
             return "not measured"
@@ -46,11 +46,11 @@ class Finding:
 
 @functools.cache
 def fault_errors() -> dict[str, Any]:
-    """The table of simulated faults: by the check's name, the fault and the error that it caused."""
+    """Return the table of simulated faults: by the check's name, the fault and its error."""
     text = importlib.resources.files("warp_ar.checks").joinpath("fault_errors.json").read_text(encoding="utf-8")
     return dict(json.loads(text))
 
 
 def worst_first(findings: list[Finding]) -> list[Finding]:
-    """Findings by what they spoil, the worst first."""
+    """Return findings sorted by their error, the worst first."""
     return sorted(findings, key=lambda finding: -finding.error)

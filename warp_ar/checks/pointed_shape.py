@@ -1,4 +1,4 @@
-"""Planes, walls and boxes from four points of one picture; no edge of the picture is looked for."""
+"""Planes, walls and boxes from four points that a user selects in one picture; no edges are detected."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _ORDER: Final = {
 
 
 def point_out(camera: Camera, pose: Pose, kind: str, points: Sequence[tuple[float, float]]) -> Proxy:
-    """Return the plane, wall or box whose corners lie nearest to four points of a picture.
+    """Return the plane, wall or box whose projected corners are nearest to four points of a picture.
 
     Args:
         camera: Camera of the picture.
         pose: ``camera_from_world``.
-        kind: ``plane``: corners of a rectangle that lies on the desk, around it; ``wall``: the left and right end of
-            its foot, then its top right and top left corner; ``box``: the ends of an edge of its base, then the corner
-            of its top above the second, then the next corner of its top, behind: all four are seen.
+        kind: ``plane``: corners of a rectangle on the receiver, in order; ``wall``: the left and right end of its foot,
+            then its top right and top left corner; ``box``: the ends of an edge of its base, then the corner of its top
+            above the second, then the next corner of its top, behind: all four are seen.
         points: Pixels.
 
     Raises:
@@ -52,9 +52,9 @@ def point_out(camera: Camera, pose: Pose, kind: str, points: Sequence[tuple[floa
     def seen(numbers: Array) -> Array:
         return project(camera, pose.apply(corners_of(kind, numbers)))
 
-    # A box's corners are counted from either end of the edge that was pointed out.
+    # A box's corners are numbered from either end of the selected edge.
     chosen = [int(np.linalg.norm(seen(shape) - pixel, axis=1).argmin()) for pixel in pixels]
-    for _ in range(6):  # Gauss-Newton: all four points count alike
+    for _ in range(6):  # Gauss-Newton with equal weights for all four points
         now = seen(shape)[chosen]
         steps = 1e-4 * np.eye(len(shape))
         jacobian = np.stack([(seen(shape + step)[chosen] - now).ravel() / 1e-4 for step in steps], 1)
@@ -84,7 +84,7 @@ def corners_of(kind: str, shape: Array) -> Array:
 
 
 def _at_height(eye: Array, rays: Array, height: float = 0.0) -> Array:
-    """Return where rays meet the desk, or a level above it, (n, 2)."""
+    """Return the intersections of rays with the receiver's plane, or a level above it, (n, 2)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         far = (height - eye[2]) / rays[:, 2]
     if not (np.isfinite(far) & (far > 0)).all():
@@ -93,7 +93,10 @@ def _at_height(eye: Array, rays: Array, height: float = 0.0) -> Array:
 
 
 def _start(kind: str, eye: Array, rays: Array) -> Array:
-    """Return numbers as ``corners_of`` takes them: two points end an edge, others lie above it and behind it."""
+    """Return initial numbers in the form of ``corners_of``.
+
+    Two points end an edge; the others are above it and behind it.
+    """
     a, b = _at_height(eye, rays if kind == "plane" else rays[:2])[:2]
     along, middle = b - a, (a + b) / 2
     width, height = float(np.linalg.norm(along)), 0.0
@@ -101,7 +104,7 @@ def _start(kind: str, eye: Array, rays: Array) -> Array:
         raise UsageError(f"two of the points are at one place; expected {_ORDER[kind]}")
     start = [math.atan2(along[1], along[0]), width]
     if kind != "plane":
-        # The height at which the ray of the third point passes the second's upright.
+        # Height at which the third point's ray passes the vertical through the second point.
         above = rays[2]
         far = float(above[:2] @ (b - eye[:2])) / max(float(above[:2] @ above[:2]), 1e-12)
         height = float(eye[2] + far * above[2])
@@ -128,6 +131,6 @@ def _proxy(kind: str, shape: Array) -> Proxy:
     if kind == "plane":
         return Proxy("plane", at=(x, y, 0.0), rotate=(0.0, 0.0, turn), size=sides)
     if kind == "wall":
-        # A plane faces its own +z; turned up about x it faces -y.
+        # A plane faces its own +z; rotated upright about x, it faces -y.
         return Proxy("plane", at=(x, y, round(sides[1] / 2, 5)), rotate=(90.0, 0.0, turn), size=sides)
     return Proxy("box", at=(x, y, round(sides[2] / 2, 5)), rotate=(0.0, 0.0, turn), size=sides)

@@ -1,1 +1,1 @@
-"""Photographs of a ball at several exposures."""
+"""Photographs of a mirror ball at several exposures."""

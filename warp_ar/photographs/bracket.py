@@ -1,18 +1,19 @@
-"""Photographs of one ball at several exposures: what their exposures really are, and how they lie over each other.
+"""Photographs of one ball at several exposures: alignment of the pictures, and their actual exposures.
 
-**Alignment.** Two exposures of one scene differ by a monotone function of codes. It is read off the joint histogram
-(the comparagram [Mann00]), and the shift and scale that make the rest least are found by Gauss-Newton with weights that
-redescend; both in turn. What the ball mirrors has thousands of edges, so a tenth of a pixel is within reach.
+**Alignment.** Two exposures of one scene differ by a monotone function of codes. It is read from the joint histogram
+(the comparagram [Mann00]). The shift and scale that minimise the remaining difference are found by Gauss-Newton with
+redescending weights; both steps alternate. The ball's reflections have thousands of edges, so an accuracy of a tenth of
+a pixel is possible.
 
-**Exposures.** Where nothing clips, the ratio of two pictures' linear values is that of their exposures. What EXIF or
-names say is believed if the pixels agree. They cannot be asked without a response: sRGB is tried first; where it does
-not hold, the response is estimated from the bracket itself, ln g(c) = ln sRGB(c) + sum_j a_j h_j(c), with hats h_j over
-the codes, by robust least squares on
+**Exposures.** The ratio of two pictures' linear values is that of their exposures, where nothing clips. Exposures by
+EXIF or file names are used if the pixels agree. That test needs a response curve. sRGB is tried first. Where it does
+not fit, the response is estimated from the bracket itself, ln g(c) = ln sRGB(c) + sum_j a_j h_j(c), with hat functions
+h_j over the codes, by robust least squares on
 
     ln g(u) - ln g(v) = ln(t_u / t_v)
 
-over pixel pairs (u, v) [DM97]. A curve can take up any one ratio, but not contradictions: equal codes mean equal light
-under every response. What remains of each step tells whether the exposures hold.
+over pixel pairs (u, v) [DM97]. A curve can absorb any single ratio, but not contradictions, because equal codes mean
+equal radiance under every response. The remaining error of each step shows if the exposures are right.
 
 References:
     [DM97] P. Debevec and J. Malik. Recovering high dynamic range radiance maps from photographs. SIGGRAPH 1997.
@@ -39,32 +40,32 @@ Image = NDArray[np.uint8]
 Circle = tuple[float, float, float]
 
 PATCH = 384
-"""Most pixels across the ball's picture in which exposures are compared."""
+"""Largest size in pixels of the ball's picture in which exposures are compared."""
 DARKEST, DIM, BRIGHTEST = 16, 40, 245
-"""Codes between which a pixel tells of light; those below ``DIM`` only where there are no others.
+"""Codes between which a pixel is used; codes below ``DIM`` only if there are no others.
 
-Flare and processing lift the darks of single pictures, and of short exposures nothing takes its darks.
+Flare and processing raise dark codes of single pictures, and a short exposure has no other source for its dark codes.
 """
 FLAT = 30
-"""Range of codes around a pixel from which on it is beside an edge: there blur mixes what clips with what does not."""
+"""Range of codes around a pixel above which it is near an edge, where blur mixes clipped with other pixels."""
 LEAST_PIXELS = 400
-"""Pixels well exposed in two pictures without which nothing is said of their ratio."""
+"""Smallest number of pixels well exposed in two pictures for a ratio."""
 HOLDS = 0.12
-"""Logarithm of the factor by which a step may be off what the pixels say."""
+"""Largest difference, as a logarithm, between an exposure step and the pixels' ratio."""
 CONTRADICTS = 0.3
-"""The same where a response is estimated with it: beyond, no response explains the exposures."""
+"""Largest such difference if a response is estimated with it; above it, no response explains the exposures."""
 FAR = 40.0
-"""Ratio of exposures beyond which what one shows is black or white in the other."""
+"""Ratio of exposures above which two pictures share no usable pixels."""
 FEATURELESS = 6.0
-"""Standard deviation of codes below which a picture shows nothing."""
+"""Standard deviation of codes below which a picture is featureless."""
 MOVED = 0.75
-"""Correlation over well exposed pixels below which a picture shows something else."""
+"""Correlation over well exposed pixels below which a picture shows another scene."""
 RELIT = 0.1
-"""Logarithm by which places that looked alike may come to differ: 0.03 under the same light."""
+"""Logarithm by which places of formerly equal brightness may differ: 0.03 under the same light."""
 GAMMAS = (0.9, 2.7)
-"""Gamma at code 40 between which cameras' responses are: 1 is linear, sRGB has 2.1."""
+"""Range of gammas at code 40 of cameras' responses: 1 is linear, sRGB has 2.1."""
 HATS = 8
-"""Unknowns of a response: values at codes evenly spaced in (c / 255)^(1 / 2)."""
+"""Number of a response's unknowns: values at codes evenly spaced in (c / 255)^(1 / 2)."""
 
 
 _LOG_SRGB = np.log(np.maximum(decode_table("srgb")[:, 1].astype(float), 1e-4))
@@ -72,22 +73,22 @@ _LOG_SRGB = np.log(np.maximum(decode_table("srgb")[:, 1].astype(float), 1e-4))
 
 @dataclasses.dataclass(frozen=True)
 class Aligned:
-    """Pictures of one ball laid over each other."""
+    """Aligned pictures of one ball."""
 
     circles: tuple[Circle, ...]
-    """Place of the ball in each: column, row, radius in pixels."""
+    """Circle of the ball in each picture: column, row, radius in pixels."""
     patches: tuple[Image, ...]
-    """The balls, all of one size and place, uint8 RGB."""
+    """Crops around the ball, all of one size, uint8 RGB."""
     correlation: tuple[float, ...]
-    """Correlation of each photograph with the one that it was aligned to; 1 for the anchor, NaN if too little is
+    """Correlation of each photograph with the one that it was aligned to; 1 for the anchor, NaN if too few pixels are
     well exposed in both."""
     changed: tuple[float, ...]
-    """Logarithm of the factor by which formerly equal places differ in each photograph from the one it was aligned
-    to; NaN if too little is well exposed in both."""
+    """Logarithm of the factor between formerly equal places, for each photograph and the one it was aligned to; NaN if
+    too few pixels are well exposed in both."""
 
     @property
     def strangers(self) -> tuple[str, ...]:
-        """Reason for each picture to be left out; empty where there is none."""
+        """Return the reason to leave out each picture; empty if there is none."""
         return tuple(map(_stranger, self.correlation, self.changed))
 
 
@@ -98,7 +99,7 @@ def _stranger(alike: float, changed: float) -> str:
 
 
 def cut_ball(image: Image, circle: Circle, size: int) -> Image:
-    """The square about a ball, its side 2.1 radii.
+    """Return the square around a ball, with a side of 2.1 radii.
 
     Args:
         image: (height, width, 3).
@@ -111,7 +112,7 @@ def cut_ball(image: Image, circle: Circle, size: int) -> Image:
     x, y, radius = circle
     scale = 2.1 * radius / size
     corner = (x - 1.05 * radius + 0.5 * scale - 0.5, y - 1.05 * radius + 0.5 * scale - 0.5)
-    # Averaged first where it is reduced: a sample stands for all the pixels that it covers.
+    # Averaged before reduction, so that a sample represents all pixels that it covers.
     blurred = cv2.GaussianBlur(image, (0, 0), 0.35 * scale) if scale > 1.5 else image
     matrix = np.array([[scale, 0.0, corner[0]], [0.0, scale, corner[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -119,7 +120,7 @@ def cut_ball(image: Image, circle: Circle, size: int) -> Image:
 
 
 def _tone_curve(u: NDArray[np.float32], v: NDArray[np.float32]) -> Array:
-    """Median code of the second picture for each code of the first, (256,), rising."""
+    """Return the median code of the second picture for each code of the first, (256,), non-decreasing."""
     bins = np.clip((u / 8).astype(int), 0, 31)
     middle = np.array([np.median(v[bins == k]) if (bins == k).sum() > 20 else np.nan for k in range(32)])
     known = np.isfinite(middle)
@@ -134,7 +135,7 @@ def _gauss_newton(
     x: NDArray[np.float32],
     y: NDArray[np.float32],
 ) -> Array:
-    """Step of (columns, rows, log scale) that makes ``seen`` more like ``wanted``, robustly."""
+    """Return the step (columns, rows, log scale) that aligns ``seen`` with ``wanted``, robustly."""
     slope_x, slope_y = (cv2.Sobel(seen, cv2.CV_32F, *way, scale=1 / 8)[ok] for way in ((1, 0), (0, 1)))
     error = (seen - wanted)[ok].astype(float)
     scale = 2.0 + 1.5 * float(np.median(np.abs(error)))
@@ -145,16 +146,16 @@ def _gauss_newton(
 
 
 def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Shift and scale that lay one picture over another of another exposure.
+    """Return the shift and scale that align a picture with another one of another exposure.
 
     Args:
         reference: uint8 RGB (n, n, 3).
         other: The same size.
-        disc: Which pixels count.
+        disc: Mask of pixels that are used.
 
     Returns:
-        (columns, rows, log of the scale about the middle) by which ``other`` must be looked up, and the correlation
-        afterwards, NaN where fewer than ``LEAST_PIXELS`` tell.
+        (columns, rows, log of the scale about the centre) at which ``other`` must be sampled, and the correlation
+        afterwards; NaN if fewer than ``LEAST_PIXELS`` can be used.
     """
     n = len(reference)
     gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in (reference, other)]
@@ -163,7 +164,7 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
     well = disc & (reference.max(2) < BRIGHTEST) & (first > DARKEST)
 
     def look(blurred: NDArray[np.float32], move: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """The other picture where ``move`` lays it over the first, and which pixels are well exposed in both."""
+        """Return the other picture sampled under ``move``, and a mask of pixels well exposed in both."""
         grow, middle = math.exp(move[2]), (n - 1) / 2
         at_x = (grow * x + middle + move[0]).astype(np.float32)
         at_y = (grow * y + middle + move[1]).astype(np.float32)
@@ -171,14 +172,14 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
         return seen, well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
 
     def alike(move: Array) -> float:
-        """Correlation; what is dark or clips in one of the two counts as well."""
+        """Return the correlation; pixels that are dark or clipped in one picture are included."""
         seen, _ = look(second, move)
         told = disc & ~((first <= DARKEST) & (seen <= DARKEST)) & ~((first >= BRIGHTEST) & (seen >= BRIGHTEST))
         if told.sum() < LEAST_PIXELS:
             return math.nan
         wanted = np.interp(first[told], np.arange(256), _tone_curve(first[told], seen[told]))
         if np.ptp(wanted) == 0.0:
-            # Nothing to see in either, or much that the first does not have.
+            # Both pictures are featureless, or one has much that the other lacks.
             return math.nan if np.std(seen[told]) < FEATURELESS else 0.0
         return float(np.corrcoef(wanted, seen[told])[0, 1])
 
@@ -201,16 +202,16 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
 def align(
     images: Sequence[Image], circles: Sequence[Circle], exposures: Sequence[float] | None = None, anchor: int = 0
 ) -> Aligned:
-    """Lay pictures of one ball over each other, each over the anchor.
+    """Align pictures of one ball with the anchor.
 
-    One that shows another thing, or shares too little with it, is laid over the nearest in exposure that was well laid
-    before: what is wrong with a picture spoils no other.
+    A picture of another scene, or with too few common pixels, is aligned with the nearest successfully aligned
+    exposure, so that a wrong picture affects no other.
 
     Args:
         images: uint8 RGB, in order of exposure.
-        circles: About where the ball is in each; exact for the anchor.
-        exposures: Of each, if known: pictures more than ``FAR`` apart have nothing in common to be aligned by.
-        anchor: Number of the picture that the others are laid over.
+        circles: Approximate circle of the ball in each; exact for the anchor.
+        exposures: Exposure of each, if known; pictures with a ratio above ``FAR`` cannot be aligned with each other.
+        anchor: Index of the picture with which the others are aligned.
     """
     size = int(min(PATCH, max(48, 2.1 * circles[anchor][2])))
     disc = _disc(size)
@@ -238,15 +239,15 @@ def align(
 
 
 def _disc(size: int) -> NDArray[np.bool_]:
-    """Pixels of a ball in its square, but for the rim."""
+    """Return the mask of a ball's pixels in its square, without the rim."""
     rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
     return np.asarray(np.hypot(rows, columns) < 0.93 * size / 2.1)
 
 
 def _change(first: Image, other: Image) -> float:
-    """Return by how much places as bright as each other in one picture differ in the other, as a logarithm.
+    """Return the logarithm by which equally bright places of one picture differ in the other.
 
-    The tone curve drops out. Light that comes from elsewhere does not.
+    The tone curve cancels out. Light from another direction does not.
     """
     (u, v), *_ = _collect((first, other))
     if len(u) < LEAST_PIXELS:
@@ -259,20 +260,20 @@ def _change(first: Image, other: Image) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Ratios:
-    """Ratios that pixels tell, of neighbouring exposures."""
+    """Ratios of neighbouring exposures, measured by pixels."""
 
     pairs: tuple[tuple[Array, Array], ...]
     """Codes (m, 3) well exposed in both pictures of each neighbouring pair."""
     curve: Array
     """Linear value of each code, (256, 3)."""
     steps: tuple[float, ...]
-    """Ratio of each picture's exposure to the one before, by the pixels; NaN where too few are well exposed."""
+    """Ratio of each picture's exposure to the one before, by the pixels; NaN if too few are well exposed."""
 
 
 def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
     disc = _disc(len(patches[0]))
     smooth = [cv2.GaussianBlur(patch, (0, 0), 1.5) for patch in patches]
-    # Beside edges a misalignment makes a ratio of its own.
+    # Near edges, misalignment changes the ratio.
     plain = [
         cv2.morphologyEx(cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
         for patch in smooth
@@ -298,7 +299,7 @@ def _steps(pairs: Sequence[tuple[Array, Array]], curve: Array) -> tuple[float, .
             continue
         low, high = (np.stack([np.interp(c[:, i], np.arange(256), curve[:, i]) for i in range(3)], 1) for c in (u, v))
         ratio = np.log(high.sum(1) / low.sum(1))
-        # Every level of brightness has the same say, however many pixels it has.
+        # Every brightness level has the same weight, independent of its number of pixels.
         bins = (u.mean(1) / 16).astype(int)
         medians = [np.median(ratio[bins == k]) for k in range(16) if (bins == k).sum() >= LEAST_PIXELS // 16]
         steps.append(float(np.exp(np.median(medians))))
@@ -306,15 +307,15 @@ def _steps(pairs: Sequence[tuple[Array, Array]], curve: Array) -> tuple[float, .
 
 
 def measure_ratios(patches: Sequence[Image], curve: Array) -> Ratios:
-    """Ratios of neighbouring exposures under a response, from aligned pictures."""
+    """Measure ratios of neighbouring exposures under a response, in aligned pictures."""
     pairs = _collect(patches)
     return Ratios(pairs, curve, _steps(pairs, curve))
 
 
 def estimate_response(ratios: Ratios, steps: Sequence[float]) -> Ratios:
-    """The response under which the pixels agree best with given steps of exposure, and what they say under it.
+    """Estimate the response that fits given exposure steps best, and return the pixels' ratios under it.
 
-    All channels share a curve: cameras bend them alike, and a white balance leaves ratios alone.
+    All channels share one curve: cameras apply the same curve to them, and white balance does not change ratios.
     """
     knots = np.linspace(0.0, 1.0, HATS + 1)
     codes = np.sqrt(np.arange(256) / 255.0)
@@ -328,7 +329,7 @@ def estimate_response(ratios: Ratios, steps: Sequence[float]) -> Ratios:
         at_u, at_v = (np.stack([np.interp(c, np.arange(256), hats[:, j]) for j in range(HATS)], 1) for c in (u, v))
         rows.append(at_v - at_u)
         wanted.append(math.log(step) - (np.interp(v, np.arange(256), base) - np.interp(u, np.arange(256), base)))
-        # Every level of brightness has the same say, however many pixels it has.
+        # Every brightness level has the same weight, independent of its number of pixels.
         bins = (u / 16).astype(int)
         share.append(1.0 / np.bincount(bins, minlength=16)[bins])
     if not rows:
@@ -350,23 +351,26 @@ def estimate_response(ratios: Ratios, steps: Sequence[float]) -> Ratios:
 
 @dataclasses.dataclass(frozen=True)
 class Exposures:
-    """Exposures that were agreed upon."""
+    """Exposures of a bracket after comparison of all statements."""
 
     ratios: tuple[float, ...]
     """Ratio of each picture's exposure to the first's."""
     curve: Array | None
-    """Linear value of each code, (256, 3), where sRGB does not hold; else None."""
+    """Linear value of each code, (256, 3), if sRGB does not fit; else None."""
     notes: tuple[str, ...]
-    """Notes that a user should know, a line each."""
+    """Notes for users, one line each."""
 
 
 def _off(claimed: Sequence[float], seen: Sequence[float]) -> float:
-    """Largest logarithm by which a step is off what the pixels say."""
+    """Return the largest logarithm of the ratio between claimed and measured steps."""
     return max((abs(math.log(c / s)) for c, s in zip(claimed, seen, strict=True) if math.isfinite(s)), default=0.0)
 
 
 def _wrong_one(claim: Sequence[float], seen: Sequence[float]) -> tuple[int, float] | None:
-    """Return the number of the picture whose claim alone is wrong, and by how much: the pixels bear out all others."""
+    """Return the index of the only picture with a wrong claim, and its error.
+
+    None unless the pixels confirm all others.
+    """
     off = [math.log(c / s) if math.isfinite(s) else 0.0 for c, s in zip(claim, seen, strict=True)]
     if len(off) < 3 or max(map(abs, off)) < CONTRADICTS:
         return None
@@ -386,10 +390,10 @@ def _number(value: float) -> str:
 
 
 def _believed(steps: dict[str, tuple[float, ...]], seen: Sequence[float], figures: str) -> tuple[str, list[str]]:
-    """Return which of the claims holds, by its name, and what is to be said of it.
+    """Return the name of the claim that the pixels confirm, and notes on it.
 
     Raises:
-        UsageError: EXIF and names contradict each other, and the pixels bear out neither.
+        UsageError: EXIF and names contradict each other, and the pixels confirm neither.
     """
     if len(steps) < 2 or _off(steps["EXIF"], steps["names"]) <= HOLDS:
         return next(iter(steps)), []
@@ -411,14 +415,14 @@ def agree_exposures(
     given: Sequence[float] | None = None,
     labels: Sequence[str] = (),
 ) -> Exposures:
-    """Find out which exposures hold.
+    """Determine the exposures of a bracket.
 
     Args:
         patches: Aligned pictures, longest exposure first.
         transfer: Response to try first.
-        exif: Exposure of each by its EXIF, None where it does not tell.
-        names: The same by the files' names.
-        given: The same as the user gives them, before which the others have no say.
+        exif: Exposure of each by its EXIF; None if unknown.
+        names: Exposure of each by its file name; None if unknown.
+        given: Exposure of each given by the user, which takes precedence.
         labels: Names of the pictures.
 
     Raises:
@@ -484,12 +488,12 @@ def agree_exposures(
 def thin_exposures(
     ratios: Sequence[float], shown: int, names: Sequence[str]
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
+    """Return the pictures of a bracket to use: one of each group within the ratio ``WAVERING``.
 
     Args:
         ratios: Exposures.
-        shown: Index of the one that stays in any case.
-        names: Of the pictures.
+        shown: Index of the exposure that is always kept.
+        names: Names of the pictures.
 
     Returns:
         Indices, longest exposure first, and a note for each that is left out.

@@ -1,4 +1,4 @@
-"""Photographs from files: 8-bit RGB, upright, with what their EXIF says."""
+"""Reading of photographs as upright 8-bit RGB, with their EXIF."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from warp_ar.sources.frame_folder import read_image
 Image = NDArray[np.uint8]
 
 ARITHMETIC = 0.02
-"""Relative deviation from equal differences below which numbers in names count pictures instead of exposures."""
+"""Largest relative deviation from equal differences at which numbers in names count pictures instead of exposures."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,15 +25,15 @@ class Photograph:
     """One photograph."""
 
     path: Path
-    """Its file."""
+    """Path of the file."""
     image: Image
     """uint8 RGB (height, width, 3), upright."""
     info: PhotoInfo
-    """Its EXIF."""
+    """EXIF data."""
 
     @property
     def name(self) -> str:
-        """The file's name."""
+        """Return the file's name."""
         return self.path.name
 
 
@@ -49,7 +49,7 @@ def read_photograph(path: str | Path) -> Photograph:
     if not path.is_file():
         raise SourceError(f"there is no photograph {path}")
     if words := foreign_words(path.suffix.lower()):
-        # Many raw files are TIFFs too, and would be read as the thumbnail in them.
+        # Many raw files are TIFFs as well, and would be read as their thumbnail.
         raise SourceError(f"{path} is {words}")
     image = read_image(path)
     try:
@@ -62,10 +62,10 @@ def read_photograph(path: str | Path) -> Photograph:
 
 
 def exposures_by_exif(photographs: Sequence[Photograph]) -> tuple[float, ...] | None:
-    """T ISO / (100 N^2) of every photograph; None where one of them does not tell.
+    """Return the exposure T ISO / (100 N^2) of every photograph; None if one of them has no exposure time.
 
     Raises:
-        SourceError: Some tell of sensitivity or aperture, and some do not.
+        SourceError: Only some photographs state sensitivity or aperture.
     """
     exposures = [photo.info.exposure for photo in photographs]
     if any(exposure is None for exposure in exposures):
@@ -79,7 +79,7 @@ def exposures_by_exif(photographs: Sequence[Photograph]) -> tuple[float, ...] | 
 
 
 def exposures_by_name(photographs: Sequence[Photograph]) -> tuple[float, ...] | None:
-    """Seconds that the files' names tell; None where they do not, or number the pictures."""
+    """Return the exposure times in seconds that file names state; None if they state none or number the pictures."""
     told = [exposure_in_name(photo.path) for photo in photographs]
     times = [time for time in told if time is not None]
     if len(times) != len(photographs) or len(set(times)) < len(times) or len(times) < 2:

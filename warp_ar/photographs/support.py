@@ -1,4 +1,4 @@
-"""The plane that things stand on, from what a hand picks in one photograph: the camera's pose without a marker."""
+"""Support plane of a photograph from points selected by a user: the camera's pose without a marker."""
 
 from __future__ import annotations
 
@@ -31,34 +31,35 @@ Array = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Support:
-    """A plane before the camera: the world's z = 0."""
+    """Plane in front of the camera, which is z = 0 in the world."""
 
     pose: Pose
-    """``camera_from_world``: x right, y away from the camera, z up; metres, or radii where no length is known."""
+    """``camera_from_world``: x right, y away from the camera, z up; in metres, or in ball radii if no length is
+    known."""
     tilt_deviation: float
     """Standard deviation of the plane's normal, degrees."""
     error: float
-    """Pixels by which the picked points miss those of the plane; 0 where nothing is left over to tell."""
+    """Root mean square distance in pixels of the selected points from the plane's points; 0 without redundancy."""
 
     def radius_of(self, sphere: Sequence[float]) -> float:
-        """Return the radius of a ball that stands on the plane, from its centre in the camera's frame over its radius.
+        """Return the radius of a ball on the plane, from its centre in the camera's frame divided by its radius.
 
-        Of all balls r sphere on the same rays it is the one whose centre is r above the plane.
+        Of all balls with the same outline, it is the one whose centre is one radius above the plane.
         """
         up = self.pose.rotation[:, 2]
         return max(float(up @ self.pose.translation / (up @ np.array(sphere) - 1.0)), 1e-3)
 
 
 def plane_from_points(camera: Camera, points: Sequence[Sequence[float]], pixels: Sequence[Sequence[float]]) -> Support:
-    """The plane z = 0 of a world in which points are known, from the pixels that show them.
+    """Return the plane z = 0 and the camera's pose from the pixels of known points.
 
     Args:
         camera: The camera.
-        points: Four or more, metres, z up.
-        pixels: Column and row of each.
+        points: Four or more points, metres, z up.
+        pixels: Column and row of each point.
 
     Raises:
-        UsageError: No camera sees the points like that.
+        UsageError: No camera pose explains the pixels.
     """
     world, seen = np.array(points, float), np.array(pixels, float)
     matrix, bent = camera.matrix(), np.array(camera.distortion)
@@ -72,12 +73,12 @@ def plane_from_points(camera: Camera, points: Sequence[Sequence[float]], pixels:
 
 
 def focal_range(camera: Camera, find: Callable[[Camera], Support], picked: float = 1.0) -> tuple[Camera, float, float]:
-    """Return a camera with the focal length under which picked points fit best, and the least and the largest that fit.
+    """Return a camera with the best focal length for selected points, and the smallest and largest that still fit.
 
     Args:
-        camera: Its focal length is not known.
-        find: Finds the plane under a camera.
-        picked: Pixels by which points may miss more than under the best.
+        camera: Camera whose focal length is unknown.
+        find: Function from a camera to the plane.
+        picked: Increase of the error in pixels, above the best one, that still fits.
     """
     lengths = math.hypot(camera.width, camera.height) * np.geomspace(0.4, 8.0, 121)
     tried = [dataclasses.replace(camera, fx=float(f), fy=float(f)) for f in lengths]
@@ -89,14 +90,14 @@ def focal_range(camera: Camera, find: Callable[[Camera], Support], picked: float
 def scene_on(
     support: Support, camera: Camera, picture: Path, light: CapturedLight, at: tuple[float, float], unit: float
 ) -> Scene:
-    """Return a scene that shows a photograph, with a mirror and a chalk ball to either side of a place on the plane.
+    """Return a scene with a photograph, and a mirror and a chalk ball on either side of a place on the plane.
 
     Args:
         support: The plane.
-        camera: Of the photograph.
+        camera: Camera of the photograph.
         picture: The photograph.
-        light: What lights the balls.
-        at: The place, x and y.
+        light: Light of the environment.
+        at: Place between the balls, x and y.
         unit: Radius of the balls.
     """
     (x, y), (a, b, c) = at, map(float, support.pose.translation)
@@ -120,13 +121,13 @@ def scene_on(
 def plane_from_rectangle(
     camera: Camera, corners: Sequence[Sequence[float]], size: tuple[float, float], picked: float = 1.0
 ) -> Support:
-    """The plane of a rectangle of known size, such as a sheet of paper, from its corners in the picture.
+    """Return the plane of a rectangle of known size, such as a sheet of paper, from its corners in the picture.
 
     Args:
         camera: The camera.
         corners: Four pixels in order round the rectangle; the first side is ``size[0]`` long and becomes the world's x.
         size: Lengths of the first and the second side, metres.
-        picked: Pixels (standard deviation) by which a corner may be off.
+        picked: Standard deviation of a corner in pixels.
 
     Raises:
         UsageError: The points are no rectangle seen from above.
@@ -136,7 +137,7 @@ def plane_from_rectangle(
         raise UsageError(f"rectangle {corners}: expected four pixels round it, and two lengths above 0")
     w, h = size
     corners_3d = np.array([[-w, -h, 0.0], [w, -h, 0.0], [w, h, 0.0], [-w, h, 0.0]]) / 2
-    # Turned the other way round the picture shows the rectangle's underside; its y then points to the camera.
+    # In the other order, the picture would show the rectangle's underside, with y toward the camera.
     (ax, ay), (bx, by) = points[1] - points[0], points[2] - points[0]
     area = 0.5 * (ax * by - ay * bx)
     if abs(area) < 8.0:
@@ -157,7 +158,7 @@ def _solve(camera: Camera, corners: Array, points: Array) -> tuple[Pose, float]:
     found, rotations, translations, errors = cv2.solvePnPGeneric(
         corners, points, camera.matrix(), np.array(camera.distortion), flags=cv2.SOLVEPNP_IPPE
     )
-    # Of the two solutions of a plane the one that explains the corners better, seen from above.
+    # Of the two solutions for a plane, the one that explains the corners better and shows it from above.
     for k in np.argsort(np.array(errors).ravel()) if found else ():
         rotation, translation = cv2.Rodrigues(rotations[k])[0], translations[k].ravel()
         if translation[2] > 0 and (rotation.T @ -translation)[2] > 0:
@@ -168,17 +169,18 @@ def _solve(camera: Camera, corners: Array, points: Array) -> tuple[Pose, float]:
 def plane_from_contact(
     sphere: Sequence[float], camera: Camera, contact: Sequence[float], radius: float = 1.0, picked: float = 2.0
 ) -> Support:
-    """The plane that touches a ball at the point that is seen, or guessed through the ball, at a pixel.
+    """Return the plane that touches a ball at a pixel, the visible or guessed point of contact.
 
-    A ball on a table touches it behind its lower half. The ray through the pixel leaves the ball there: the normal is
-    the ball's own at that point. A pixel off by d is a normal off by d over the radius in pixels, more near the rim.
+    A ball touches the table behind its lower half, where the ray through the pixel leaves the ball. The plane's normal
+    is the ball's normal at that point. An error of d pixels tilts the normal by d divided by the radius in pixels, and
+    by more near the rim.
 
     Args:
         sphere: The ball's centre in the camera's frame over its radius.
         camera: The camera.
         contact: Column and row of the point of contact.
-        radius: Of the ball, metres; 1 if not known: the world is then in radii.
-        picked: Pixels (standard deviation) by which the contact may be off.
+        radius: Radius of the ball, metres; 1 if unknown: the world's unit is then the radius.
+        picked: Standard deviation of the point of contact in pixels.
 
     Raises:
         UsageError: The pixel is not on the ball.
@@ -203,7 +205,7 @@ def plane_from_contact(
     forward /= np.linalg.norm(forward)
     rotation = np.stack([np.cross(forward, up), forward, up], 1)
     foot = radius * (center - up)
-    # The world's origin is the point of contact.
+    # The point of contact is the world's origin.
     return Support(
         Pose(rotation, foot), float(np.hypot(max(turned[:2], default=90.0), max(turned[2:], default=90.0))), 0.0
     )

@@ -1,12 +1,12 @@
-"""The table around a photographed mirror ball: what it tells of the ball's reflectance and of the light's level.
+"""Measurements by the table around a photographed mirror ball: the ball's reflectance, and the light's level.
 
-The ball mirrors the table, which the photograph shows beside it as well: the ratio of both is the ball's reflectance
-(``ball/ball_reflectance.py``). And no table sends more light than it gets. With radiance L of the table in the
+The ball mirrors the table, which the photograph also shows directly: the ratio of both is the ball's reflectance
+(``ball/ball_reflectance.py``). No table reflects more light than it receives. With radiance L of the table in the
 photograph and irradiance E on it by the captured light, its reflectance is
 
     rho = pi L / E,
 
-and a light under which rho is above ``WHITEST`` is too low: the ball reflects less than was taken, or lamps clip.
+Light for which rho is above ``WHITEST`` is too dark: the ball's reflectance is lower than assumed, or lamps clip.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ from warp_ar.scene.pixel_rays import project
 Array = NDArray[np.float64]
 
 WHITEST: Final = 0.9
-"""Reflectance that no table exceeds: white paper has 0.85."""
+"""Largest reflectance of a table; white paper has 0.85."""
 REACH: Final = (2.0, 6.0)
-"""Radii of the ball from its foot between which the table is looked at: nearer the ball shades it."""
+"""Range of distances from the ball's foot, in radii, at which the table is measured; closer, the ball shades it."""
 SHARE: Final = 90.0
-"""Percentile of the table that is its brightest part, free of shadows: what is above may shine."""
+"""Percentile of the table's radiance that counts as its brightest part without shadows; above it are specular
+reflections."""
 FEWEST: Final = 40
-"""Points of the table that must be seen."""
+"""Smallest number of visible points of the table."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A ball on a table in a photograph, with the table's plane."""
+    """Ball on a table in a photograph, with the table's plane."""
 
     image: NDArray[np.uint8]
     """uint8 RGB, upright."""
@@ -47,7 +48,7 @@ class Table:
     support: Support
     """The table's plane."""
     probe: Probe
-    """The ball, as large as one that stands on the plane."""
+    """The ball, with the radius of a ball that stands on the plane."""
     table: NDArray[np.float32]
     """Linear value of each code, (256, 3)."""
 
@@ -60,7 +61,7 @@ class Table:
         support: Support,
         table: NDArray[np.float32],
     ) -> Table:
-        """Return the table under a ball that is seen at an outline."""
+        """Return the table below a ball with a given outline."""
         radius = support.radius_of(outline.sphere)
         x, y, z = map(float, support.pose.inverse().apply(radius * np.array(outline.sphere)))
         return cls(image, camera, support, Probe((x, y, z), radius), table)
@@ -71,12 +72,12 @@ class Table:
         return Scene(camera=self.camera, probes=(self.probe,), proxies=proxies, has_marker=False, name="table")
 
     def reflectance_of_ball(self) -> Reflected | None:
-        """Return the ball's reflectance; None where it mirrors too little of what the photograph shows beside it."""
+        """Return the ball's reflectance; None if it mirrors too little of the photograph's visible table."""
         view = self.image, self.support.pose
         return measure_reflectance(self._scene(), self.camera, self.probe, view, self.table)
 
     def reflectance_under(self, irradiance: Array) -> float:
-        """Return the reflectance of the table's brightest part under irradiance (3,); 0 where too little is seen."""
+        """Return the reflectance of the table's brightest part under irradiance (3,); 0 if too little is visible."""
         angle, away = np.meshgrid(np.arange(48) * np.pi / 24, np.linspace(*REACH, 16))
         x, y, _ = self.probe.center
         away = self.probe.radius * away.ravel()

@@ -3,9 +3,11 @@
 A sampler has times t_k and values v_k. Before the first and after the last key it holds that key's value. Between two
 keys, with d = t_{k+1} - t_k and s = (t - t_k) / d, glTF 2.0 (appendix C) defines three interpolations:
 
-- ``STEP``: v_k; - ``LINEAR``: (1 - s) v_k + s v_{k+1}; rotations follow the shorter arc at constant angular speed; -
-``CUBICSPLINE``, with tangents in a and out b of each key: (2s^3 - 3s^2 + 1) v_k + d (s^3 - 2s^2 + s) b_k + (-2s^3 +
-3s^2) v_{k+1} + d (s^3 - s^2) a_{k+1}; rotations are normalized afterwards.
+- ``STEP``: v_k;
+- ``LINEAR``: (1 - s) v_k + s v_{k+1}; rotations follow the shorter arc at constant angular speed;
+- ``CUBICSPLINE``, with tangents in a and out b of each key:
+  (2s^3 - 3s^2 + 1) v_k + d (s^3 - 2s^2 + s) b_k + (-2s^3 + 3s^2) v_{k+1} + d (s^3 - s^2) a_{k+1}; rotations are
+  normalized afterwards.
 
 A node's transform is T R S. All triangles below one animated node form one ``MovingPart``: a mesh in that node's
 coordinates. A rigid part's mesh is built once; skins and morph targets compute new vertices for every frame.
