@@ -1,1 +1,1 @@
-"""Light of the environment beyond what the ball shows: recovered, captured, measured."""
+"""Light of the environment beyond the ball's frames: recovered from surfaces, captured, estimated from cards."""

@@ -1,29 +1,30 @@
-"""Test that recovered light reaches the ball, by the surface around the ball's own shadow.
+"""Test that recovered light reaches the ball, using the surface around the ball's own shadow.
 
-The card says how much light is missing, and shading where it comes from; but what lights them need not light the ball:
-clutter that nobody modelled may hide it there, and what clips in the ball may not be what lights the card. Light that
-passes close to the ball falls on the planes beside its shadow, and what is hidden from the ball is hidden there too.
-With e the irradiance as captured, a what an estimate adds and f the share of a that reaches the ball, a point of a
-plane shows
+The card measures how much light is missing, and shading its directions. But light on them need not reach the ball:
+unmodelled clutter may occlude it there, and clipped light in the ball may not be the light on the card. Light that
+passes close to the ball falls on the planes next to its shadow, and light that is occluded at the ball is missing there
+too. With e the captured irradiance, a the irradiance that an estimate adds and f the share of a that reaches the ball,
+a point of a plane shows
 
     log L = level + log(e + f a) + texture.
 
-Two groups of points tell f, each against all points of its plane to which hardly any of a passes by the ball:
+Two groups of points determine f, each relative to all points of the plane at which hardly any of a passes the ball:
 
-- **Beside the shadow**, within two radii of the ball: the level is that of the plane elsewhere, where f = 1. They say
-  whether the light is there at all. What hides it on both sides of the shadow hides it from the ball between them, and
-  f is taken. Where one side alone is dark, a shadow's edge passes, and the ball may lie in the light.
-- **Across the shadow**, within 3.5 radii: the level is free. They say whether the ball throws the shadow that the
-  estimate says. If it does not, the light comes from elsewhere; the card says that it is there. Light from a
-  direction b in place of a, over all normals, is best met by the factor (irradiances max(n . a, 0), max(n . b, 0))
+- **Next to the shadow**, within two radii of the ball: the level is that of the plane elsewhere, where f = 1. These
+  points measure whether the light is there at all. An occluder on both sides of the shadow also occludes the ball
+  between them, and f is used. If only one side is dark, it is at the edge of another shadow, and the ball may be lit.
+- **Across the shadow**, within 3.5 radii: the level is free. These points measure whether the ball casts the estimated
+  shadow. If it does not, the light comes from another direction, because the card shows that it exists. Light from a
+  direction b instead of a is best approximated, over all normals, by the factor (irradiances max(n . a, 0), max(n . b,
+  0))
 
         mean over b of X . D / |X|^2 = (1 / 4)^2 / (1 / 6) = 3 / 8,
 
-  so that f + 3/8 (1 - f) is taken.
+  so that f + 3/8 (1 - f) is used.
 
-Either is listened to only where the cost, twice a negative log likelihood, falls from f = 1 by as much as is asked of a
-new emitter: where the evidence is good, nothing is lost, and where there is none, nothing changes. Emitters stand where
-they were found, near or far; a near one lights a plane unevenly, which is no shadow.
+Either group is used only if the cost, twice a negative log likelihood, decreases from f = 1 by as much as a new emitter
+needs: reliable light is kept, and without evidence nothing changes. Emitters keep their distances; a near one lights a
+plane unevenly, which is no shadow.
 """
 
 from __future__ import annotations
@@ -39,32 +40,32 @@ from warp_ar.light.problem import Problem
 Array = NDArray[np.float64]
 
 ELSEWHERE = 3.0 / 8.0
-"""Factor that light of unknown direction is best met by."""
+"""Best factor for light of unknown direction."""
 SHARES = np.linspace(0.0, 1.0, 41)
-"""Values of f that are tried."""
+"""Values of f to evaluate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Ball:
-    """Ball in which light is looked for."""
+    """Ball in which light was observed."""
 
     center: Array
-    """Metres, (3,)."""
+    """Centre, metres, (3,)."""
     radius: float
-    """Metres; 0: a point, which throws no shadow."""
+    """Radius, metres; 0: a point without a shadow."""
 
 
 def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[float, ...]) -> tuple[Array, Array]:
-    """Share of what an estimate adds at each point that passes the ball closely or is stopped by it, (reaches, n).
+    """Return the share of an estimate's light at each point whose rays pass the ball closely or hit it, (reaches, n).
 
-    And on which side of the ball it passes within the first reach: above 0 where a point that looks toward the light
-    has the ball on its right, (n,).
+    The second result is the side of the ball on which the light passes within the first reach, (n,): positive if the
+    ball is on the right of a point that faces the light.
 
     Args:
         problem: The equations.
         unknowns: Radiance of parts, then power of candidates, (parts + candidates, 3).
         ball: The ball.
-        reach: Radii from the ball's middle within which a ray passes closely.
+        reach: Distances from the ball's centre, in radii, within which a ray passes closely.
     """
     distant, near = problem.distant_radiance(unknowns), problem.near_emitters(unknowns)
     power = (distant * problem.missing).sum(axis=1) * problem.solid_angle
@@ -73,9 +74,9 @@ def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[f
     across = np.cross(problem.normals, to_ball)
 
     def add(direction: Array, weight: Array, length: Array | float) -> None:
-        """Rays (n or 1, k, 3) of a weight (n, k) and a length."""
+        """Add rays with directions (n or 1, k, 3), weights (n, k) and lengths."""
         along = (to_ball[:, None] * direction).sum(axis=2)
-        # Squared distance of the ball's middle from the ray, in radii.
+        # Squared distance of the ball's centre from the ray, in radii.
         off = ((to_ball**2).sum(axis=1)[:, None] - along**2) / ball.radius**2
         ahead = (along > 0.0) & (along < length)
         for k, radii in enumerate(reach):
@@ -97,14 +98,14 @@ def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[f
 
 
 def costs(given: Array, scatter: float, level: float, known: float | None) -> Array:
-    """Twice the negative log likelihood of each of ``SHARES``, (shares,).
+    """Return twice the negative log likelihood of each of ``SHARES``, (shares,).
 
     Args:
-        given: Of points: light that they show, irradiance as captured, irradiance that the estimate adds, and how many
-            share one error, (4, n).
-        scatter: Standard deviation of the logarithm of one point.
-        level: Logarithm of light over irradiance, of the plane elsewhere.
-        known: Standard deviation of that level here; None: it is free.
+        given: Radiance, captured irradiance, added irradiance, and the number of points that share one error, for each
+            point, (4, n).
+        scatter: Standard deviation of the logarithm of one point's radiance.
+        level: Logarithm of radiance over irradiance of the plane elsewhere.
+        known: Standard deviation of that level here; None: the level is free.
     """
     shown, captured, added, shared = given
     logs = np.log(shown) - level - np.log(np.maximum(captured + SHARES[:, None] * added, 1e-9))
@@ -120,11 +121,12 @@ def costs(given: Array, scatter: float, level: float, known: float | None) -> Ar
 
 
 def share_told(cost: Array, sides: Array | None = None) -> float:
-    """Return f as nearly all of the likelihood has it at least; 1 where the evidence is not worth listening to.
+    """Return a lower bound of f, which holds with most of the likelihood; 1 without sufficient evidence.
 
     Args:
-        cost: From ``costs``, (shares,).
-        sides: The same of points on either side of the shadow, each of which must say half of it, (2, shares).
+        cost: Costs from ``costs``, (shares,).
+        sides: Costs of the points on either side of the shadow, each of which must give half of the evidence, (2,
+            shares).
     """
     if cost[-1] - cost.min() < CONFIG.search.evidence:
         return 1.0
@@ -135,7 +137,7 @@ def share_told(cost: Array, sides: Array | None = None) -> float:
 
 
 def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
-    """Return the factor on an estimate, 0 to 1, for what the planes around the ball show of it.
+    """Return the factor on an estimate, 0 to 1, that the planes around the ball support.
 
     Args:
         problem: The equations.
@@ -150,7 +152,7 @@ def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
     if not usable.any():
         return 1.0
     shown, captured = problem.light.sum(axis=1), problem.captured.sum(axis=1)
-    # Where a plane shows nothing exactly, its points have no logarithm and no part in what follows.
+    # Unusable points have no logarithm and are ignored below.
     ratio = np.full(len(shown), np.nan)
     ratio[usable] = np.log(shown[usable]) - np.log(np.maximum((captured + added)[usable], 1e-9))
     given = np.stack([shown, captured, added, problem.shared])
@@ -174,6 +176,6 @@ def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
 
 
 def _level(ratio: Array) -> tuple[float, float]:
-    """Median and standard deviation of logarithms of light over irradiance, (n,)."""
+    """Return median and standard deviation of logarithms of radiance over irradiance, (n,)."""
     level = float(np.median(ratio))
     return level, max(1.4826 * float(np.median(np.abs(ratio - level))), CONFIG.shadow.scatter)

@@ -1,11 +1,11 @@
-"""Captured light: an environment that is kept in a file, and lights other pictures than the one it was captured from.
+"""Captured light: an environment in a file, for lighting other pictures than those it was captured from.
 
-The file is an OpenEXR latlong: channels R, G, B (linear, in camera values of the exposure that was shown: 1 clips) and
-``confidence`` (0 where nothing was seen and neighbours filled in, to 1). Attributes say how to read it: ``axes``,
-``chromaticities``, ``whiteLevel`` (the value at which the capture's camera clipped), ``exposure`` (t ISO / (100 N^2), 0
-if not known), ``lowerBound`` (the share of the light that is a lower bound, because even the shortest exposure clips)
-and ``emitters``, JSON. A file without them is of another program: its
-values are read as `exr_file.read_linear_picture` says, its axes as `latlong_axes.axes_of`.
+The file is an OpenEXR latlong with channels R, G, B (linear, in camera values of the shown exposure: 1 clips) and
+``confidence`` (1: seen; 0: filled from neighbours). Its attributes are ``axes``, ``chromaticities``, ``whiteLevel``
+(the value at which the capture's camera clipped), ``exposure`` (t ISO / (100 N^2), 0 if unknown), ``lowerBound`` (the
+share of the light that is a lower bound, because it clips in the shortest exposure) and ``emitters`` (JSON). A file of
+another program lacks them: its values are read as by `exr_file.read_linear_picture`, its axes as by
+`latlong_axes.axes_of`.
 """
 
 from __future__ import annotations
@@ -34,46 +34,46 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 BRIGHT = 6.0
-"""Times the mean radiance from which on a texel is part of an emitter."""
+"""Radiance over the map's mean from which a texel is part of an emitter."""
 MOST_EMITTERS = 12
 LEAST_SHARE = 0.01
-"""Least share of the irradiance of all directions for a listed emitter."""
+"""Least share of a listed emitter in the irradiance from all directions."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CapturedEmitter:
-    """A bright source in captured light, which the map holds as well."""
+    """Bright source in captured light; the map includes its light."""
 
     direction: tuple[float, float, float]
-    """Unit, from the ball's centre."""
+    """Unit vector from ``origin``."""
     solid_angle: float
-    """Steradians."""
+    """Solid angle, steradians."""
     power: tuple[float, float, float]
     """Radiance times solid angle, RGB."""
     low: tuple[float, float, float]
-    """Lower end of the interval that holds its power."""
+    """Lower end of the power's interval."""
     high: tuple[float, float, float] | None
-    """Upper end; None where it clips in every exposure."""
+    """Upper end of the power's interval; None if the emitter clips in every exposure."""
     distance: float | None = None
-    """Metres from ``origin``; None: as distant as the environment."""
+    """Distance from ``origin`` in metres; None: as distant as the environment."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Point from which direction and distance count, metres."""
+    """Point from which direction and distance are measured, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Light:
-    """Light of an environment, with what is known of how far it holds."""
+    """Light of an environment, with its confidence, its emitters and its limits."""
 
     radiance: Map
     """Linear RGB, float32 (height, 2 height, 3), in camera values of the exposure that was shown."""
     confidence: Map
-    """0 to 1, float32 (height, 2 height)."""
+    """Confidence of each texel, 0 to 1, float32 (height, 2 height)."""
     emitters: tuple[CapturedEmitter, ...] = ()
     """Bright sources, most powerful first."""
     white_level: float = 1.0
     """Value at which the capture's camera clipped."""
     exposure: float | None = None
-    """t ISO / (100 N^2) of the exposure that was shown, if known."""
+    """Exposure t ISO / (100 N^2) that was shown; None if unknown."""
     lower_bound: float = 0.0
     """Share of the light that is a lower bound, 0 to 1."""
 
@@ -81,7 +81,7 @@ class Light:
         """Check all values.
 
         Raises:
-            UsageError: A map has another shape or holds a number that is not finite, or a number is out of its range.
+            UsageError: A map has another shape or a number that is not finite, or a number is out of its range.
         """
         check_fields(self)
         for name, components in (("radiance", (3,)), ("confidence", ())):
@@ -101,7 +101,7 @@ class Light:
 
         Args:
             path: The file.
-            axes: One of ``latlong_axes.AXES``, in which the file has it.
+            axes: Axes of the file, one of ``latlong_axes.AXES``.
 
         Raises:
             SinkError: The file cannot be written.
@@ -135,7 +135,8 @@ class Light:
 
         Args:
             path: The file.
-            axes: One of ``latlong_axes.AXES``; None: as the file says, else by the custom of its format (`axes_of`).
+            axes: One of ``latlong_axes.AXES``; None: those that the file states, else the convention of its format
+                (`axes_of`).
 
         Raises:
             SceneError: The file cannot be used.
@@ -146,7 +147,7 @@ class Light:
         if width != 2 * height or height < 2:
             raise SceneError(f"{path} is {width}x{height}: a latlong environment is twice as wide as high")
         axes = axes_of(picture, path, axes, SceneError, str(path))
-        radiance = np.clip(picture.color, 0.0, 1e6)  # maps in the wild hold negative pixels
+        radiance = np.clip(picture.color, 0.0, 1e6)  # files in circulation have negative pixels
         header = picture.header
         confidence = np.clip(picture.others.get("confidence", np.ones((height, width), np.float32)), 0.0, 1.0)
         emitters = _parse_emitters(path, header.get("emitters", "[]"))
@@ -163,11 +164,11 @@ class Light:
         )
 
     def resampled(self, height: int, rotation: Array | None = None) -> Map:
-        """The map at another size and turned, (height, 2 height, 3).
+        """Return the map at another size and in rotated axes, (height, 2 height, 3).
 
         Args:
-            height: Rows.
-            rotation: From the light's axes to those of the result, (3, 3).
+            height: Rows of the result.
+            rotation: Rotation from the light's axes to those of the result, (3, 3).
         """
         source = self.radiance
         if source.shape[0] > height:
@@ -177,7 +178,7 @@ class Light:
                 return np.ascontiguousarray(source)
             rotation = np.eye(3)
         rows, columns = source.shape[:2]
-        # Beyond a pole lies its other side, beyond the right edge the left one.
+        # A map continues beyond a pole on its opposite side, and beyond its right edge at the left one.
         poles = [np.roll(source[row : row + 1], columns // 2, 1) for row in (0, rows - 1)]
         wide = np.concatenate([poles[0], source, poles[1]], 0)
         wide = np.concatenate([wide[:, -1:], wide, wide[:, :2]], 1)
@@ -195,7 +196,7 @@ class Light:
 
 
 def latlong_directions(height: int, dy: float = 0.5, dx: float = 0.5) -> Array:
-    """Unit directions (height, 2 height, 3) at a place within each texel."""
+    """Return unit directions (height, 2 height, 3) of a point in each texel, ``dy`` and ``dx`` from its corner."""
     theta = (np.arange(height) + dy)[:, None] * (math.pi / height)
     phi = (np.arange(2 * height) + dx)[None, :] * (math.pi / height) - math.pi
     s = np.sin(theta)
@@ -203,7 +204,7 @@ def latlong_directions(height: int, dy: float = 0.5, dx: float = 0.5) -> Array:
 
 
 def texel_solid_angles(height: int) -> Array:
-    """Steradians of the texels of each row, (height, 1)."""
+    """Return the solid angle in steradians of a texel of each row, (height, 1)."""
     edges = np.cos(np.arange(height + 1) * math.pi / height)
     return np.asarray((edges[:-1] - edges[1:])[:, None] * (math.pi / height))
 
@@ -218,13 +219,13 @@ def irradiance_above(radiance: Map) -> Array:
 def find_emitters(
     radiance: Map, clipped: Map, error: float, captured: Map | None = None
 ) -> tuple[CapturedEmitter, ...]:
-    """Bright sources of a map, by what they bring.
+    """Return the bright sources of a map, the most powerful first.
 
     Args:
-        radiance: (height, 2 height, 3).
-        clipped: Share that clips in every exposure, of the same shape.
-        error: Relative error of what does not clip.
-        captured: The same map as it was seen, where what clips was raised in ``radiance``: lower ends count by it.
+        radiance: Latlong map, (height, 2 height, 3).
+        clipped: Share of each texel that clips in every exposure, same shape.
+        error: Relative error of radiance that does not clip.
+        captured: Map before clipped radiance was raised; lower ends of intervals are taken from it. None: ``radiance``.
     """
     captured = radiance if captured is None else captured
     height = len(radiance)
@@ -233,7 +234,7 @@ def find_emitters(
     total = float((gray * area).sum())
     bright = (gray > BRIGHT * total / (4 * math.pi)) | (clipped.max(2) > 0.5)
     count, labels = cv2.connectedComponents(bright.astype(np.uint8), connectivity=8)
-    # The map's left and right edges are one.
+    # The map's left and right edges are adjacent.
     for a, b in zip(labels[:, 0], labels[:, -1], strict=True):
         if a and b and a != b:
             labels[labels == b] = a
@@ -280,7 +281,7 @@ def _turned(emitter: CapturedEmitter, rotation: Array) -> CapturedEmitter:
 
 
 def has_places(path: str | Path) -> bool:
-    """Return whether a captured light says how far away an emitter is; False where the file cannot be read."""
+    """Return True if a captured light has an emitter of known distance; False also if the file cannot be read."""
     path = Path(path)
     if path.suffix.lower() == ".hdr":
         return False
@@ -288,17 +289,17 @@ def has_places(path: str | Path) -> bool:
         header = read_exr_header(path, SceneError, str(path))
         return any(emitter.distance is not None for emitter in _parse_emitters(path, header.get("emitters", "[]")))
     except SceneError:
-        return False  # reading the light says why
+        return False  # reading the light reports the reason
 
 
 def placed_emitters(light: Light, scale: float, rotation: Array, most: int) -> list[dict[str, Any]]:
-    """Fields of ``kernels.structs.Emitter`` for the emitters that stand at a known distance.
+    """Return fields of ``kernels.structs.Emitter`` for the emitters of known distance.
 
     Args:
-        light: As it was read.
-        scale: Factor to the values of the frames' camera.
-        rotation: From the light's axes to the scene's, (3, 3).
-        most: How many at most, the most powerful ones.
+        light: Light as it was read.
+        scale: Factor to the camera values of the frames.
+        rotation: Rotation from the light's axes to the scene's, (3, 3).
+        most: Largest number of emitters; the most powerful are kept.
     """
     return [
         {

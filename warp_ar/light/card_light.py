@@ -1,18 +1,17 @@
-"""Light where no mirror ball is: what the card, planes and boxes of a frame tell of it, and how surely.
+"""Light without a mirror ball, estimated from the card, planes and boxes of a frame, with its uncertainty.
 
-The world around is ``ROWS`` x 2 ``ROWS`` cells of constant radiance x. A point p of a surface of reflectance rho shows
+The environment is ``ROWS`` x 2 ``ROWS`` cells of constant radiance x. A point p of a surface of reflectance rho shows
 
     r_p = rho / pi sum_c x_c max(n_p . d_c, 0) V_pc w_c,
 
-w_c the solid angle of a cell, V_pc 1 where no box hides it. The white of the card is known; other reflectances follow
-from the light, in turn with it. A direction in which the frame shows something has the radiance that it shows.
-Before anything is seen, cells are what the card says in the mean, and below the horizon as bright as the table (m),
-with a covariance P by ``SPREAD`` and ``REACH``. With rows A, values b and noise S the light is the x >= 0 that
-minimises (x - m)' P^-1 (x - m) + (A x - b)' S^-1 (A x - b); (P^-1 + A' S^-1 A)^-1 is its covariance.
+w_c is the solid angle of a cell; V_pc is 1 where no box occludes it. The card's white is known; other reflectances are
+estimated from the light, in alternation with it. Directions that the frame shows have the radiance in the frame. The
+prior of a cell's radiance has the mean m, which is that of the card and, below the horizon, as bright as the table, and
+the covariance P by ``SPREAD`` and ``REACH``. With rows A, values b and noise S the light is the x >= 0 that minimises
+(x - m)' P^-1 (x - m) + (A x - b)' S^-1 (A x - b); its covariance is (P^-1 + A' S^-1 A)^-1.
 
-A card that lies flat says nothing of what shines across it. ``SIDES`` is how much of the light is taken to come from
-near the horizon: where no face of a box is seen, as much as lets an upright face have a flat one's irradiance, as under
-a constant light.
+A flat card does not measure light from the horizon. ``SIDES`` is the assumed share of light from near the horizon. If
+no face of a box is visible, it gives an upright face the irradiance of a flat one, as under constant light.
 """
 
 from __future__ import annotations
@@ -38,45 +37,45 @@ Mask = npt.NDArray[np.bool_]
 
 ROWS: Final = 8
 SIDES: Final = (0.9, 0.3)
-"""Share of the card's light from near the horizon, before anything is seen: without a face of a box, and with one."""
+"""Prior share of the card's light from near the horizon: without a visible face of a box, and with one."""
 NEAR_HORIZON: Final = 0.25
-"""Height above the horizon, as a sine, by which that light has fallen to 1 / e."""
+"""Sine of the height above the horizon at which that light has fallen to 1 / e."""
 SPREAD: Final = (0.7, 0.4)
-"""Relative standard deviation of a cell above and below the horizon, before anything is seen."""
+"""Prior relative standard deviation of a cell above and below the horizon."""
 REACH: Final = 0.8
-"""Radians by which the resemblance of cells falls to 1 / e."""
+"""Angle in radians at which the correlation of cells has fallen to 1 / e."""
 NOISE: Final = {Kind.CARD: 0.02, Kind.PLANE: 0.1, Kind.FACE: 0.05}
-"""Relative standard deviation of what a surface shows, by its kind; that of a texture is no less with more points."""
+"""Relative standard deviation of a surface's radiance, by kind; for textures it does not fall with more points."""
 INDEPENDENT: Final = 4
-"""Points of a plane or box that are taken to have noise of their own."""
+"""Number of points of a plane or box that count as independent."""
 SEEN: Final = 0.2
-"""Relative standard deviation of a cell that the frame shows in part."""
+"""Relative standard deviation of a cell that is partly visible in the frame."""
 CLIPPED: Final = 250
-"""Code from which a channel says nothing."""
+"""Code from which a channel counts as clipped and is not used."""
 EXCESS: Final = 1.3
-"""Factor on the light of a card that clips."""
+"""Factor on the light of a clipped card."""
 STEP: Final = 12
-"""Pixels between directions that are looked at."""
+"""Pixels between examined directions."""
 CENTER: Final = (0.0, 0.0, 0.05)
-"""Place of the light, metres: above the card, where objects stand."""
+"""Position for which the light is estimated, metres: above the card, where objects stand."""
 TURNS: Final = 6
-"""Times that reflectances and light are found in turn."""
+"""Number of alternations between reflectances and light."""
 WITHIN: Final = 7.5
-"""Standard deviations that hold nine tenths of the errors on desks of known light: most of an error is not noise, but
-light from where no surface looks."""
+"""Standard deviations within which nine tenths of the errors lie on desks of known light: most of an error is not noise
+but light from directions that no surface faces."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CardLight:
-    """Light of one frame, good for irradiance: of second order, with one main direction."""
+    """Light of one frame for irradiance: of second order, with one main direction."""
 
     radiance: npt.NDArray[np.float32]
-    """Latlong, z up, (``ROWS``, 2 ``ROWS``, 3), camera values."""
+    """Latlong radiance, z up, (``ROWS``, 2 ``ROWS``, 3), camera values."""
     covariance: Array
     """Covariance of the cells, by channel, (3, cells, cells)."""
 
     def irradiance(self, normals: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return the irradiance on surfaces that face ``normals``, and half its interval of 90 %, (n, 3)."""
+        """Return the irradiance of surfaces with normals ``normals``, and half its 90 % interval, (n, 3)."""
         directions, angles = _cells()
         weights = np.maximum(np.asarray(normals, np.float64) @ directions.T, 0.0) * angles
         variance = np.einsum("nc,kcd,nd->nk", weights, self.covariance, weights)
@@ -84,19 +83,19 @@ class CardLight:
 
     @property
     def main_direction(self) -> Array:
-        """Unit direction that most of the light comes from, (3,)."""
+        """Return the unit direction from which most of the light comes, (3,)."""
         directions, angles = _cells()
         sum_: Array = (self.radiance.reshape(-1, 3).mean(axis=1) * angles) @ directions
         return sum_ / max(float(np.linalg.norm(sum_)), 1e-12)
 
     @property
     def latlong(self) -> npt.NDArray[np.float32]:
-        """The radiance as an environment's file holds it, (32, 64, 3)."""
+        """Return the radiance at the size of an environment's file, (32, 64, 3)."""
         return np.repeat(np.repeat(self.radiance, 32 // ROWS, axis=0), 32 // ROWS, axis=1)
 
     @property
     def words(self) -> str:
-        """The irradiance from above with its interval, and the main direction, in one line."""
+        """Return irradiance from above with its interval, and the main direction, in one line."""
         value, half = (float(part.mean()) for part in self.irradiance(np.array([[0.0, 0.0, 1.0]])))
         x, y, z = self.main_direction
         told = f"from above {value:.2f} +- {half:.2f} camera values, mainly from ({x:.2f}, {y:.2f}, {z:.2f})"
@@ -104,15 +103,15 @@ class CardLight:
 
 
 def light_by_card(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> CardLight:
-    """Return the light that the surfaces of a frame tell of.
+    """Estimate the light from the surfaces in a frame.
 
     Args:
         image: RGB codes, (height, width, 3).
-        scene: Its marker, planes and boxes; its camera at the size of the frame.
+        scene: Scene with a marker, planes and boxes; its camera has the frame's size.
         pose: ``camera_from_world``.
 
     Raises:
-        UsageError: The frame shows nothing of the marker's white paper.
+        UsageError: The frame does not show the marker's white paper.
     """
     shown = _look(image, scene, pose)
     if not (shown.group == 0).any():
@@ -125,21 +124,21 @@ def light_by_card(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> Car
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Shown:
-    """Values that a frame shows of surfaces, and in directions."""
+    """Values that a frame shows at surface points, and in directions of the environment."""
 
     values: Array
     """Linear values at points, (n, 3)."""
     exact: Mask
-    """True where they do not clip, (n, 3)."""
+    """True where values do not clip, (n, 3)."""
     kind: npt.NDArray[np.int64]
     group: npt.NDArray[np.int64]
-    """Number of the surface: 0 is the card."""
+    """Index of each point's surface; 0 is the card."""
     transfer: Array
-    """Irradiance at points by the radiance of cells, (n, cells)."""
+    """Transfer from the radiance of cells to the irradiance of points, (n, cells)."""
     cells: npt.NDArray[np.int64]
-    """Cells that the frame shows."""
+    """Indices of the cells that the frame shows."""
     radiance: Array
-    """Mean linear values that it shows there, (m, 3)."""
+    """Mean linear values of those cells, (m, 3)."""
 
 
 def _look(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> _Shown:
@@ -211,7 +210,7 @@ def _solve(shown: _Shown, white: float, channel: int) -> tuple[Array, Array]:
 
 
 def _cells() -> tuple[Array, Array]:
-    """Return directions (cells, 3) and solid angles (cells,) of the cells, rows from +z down, columns from -x by y."""
+    """Return directions (cells, 3) and solid angles (cells,) of cells; rows from +z down, columns from -x through y."""
     theta = (np.arange(ROWS) + 0.5) / ROWS * np.pi
     phi = ((np.arange(2 * ROWS) + 0.5) / ROWS - 1.0) * np.pi
     theta, phi = (part.ravel() for part in np.meshgrid(theta, phi, indexing="ij"))
@@ -230,13 +229,13 @@ def _cell_of(directions: Array) -> npt.NDArray[np.int64]:
 
 
 def _blur(image: npt.NDArray[np.uint8], decode: Array) -> tuple[Array, Mask]:
-    """Return linear values in means of 5 x 5 pixels, and where none of these clips."""
+    """Return linear values as means of 5 x 5 pixels, and a mask of means without clipped pixels."""
     linear = np.stack([decode[image[..., c], c] for c in range(3)], -1)
     return cv2.blur(linear, (5, 5)), cv2.blur((image >= CLIPPED).astype(np.float32), (5, 5)) == 0.0
 
 
 def _hidden(points: Array, directions: Array, proxies: tuple[Proxy, ...]) -> Mask:
-    """Return True where boxes hide what lies in directions (1 or n, m, 3) of points (n, 3), (n, m)."""
+    """Return a mask, (n, m), of directions (1 or n, m, 3) in which boxes occlude the environment at points (n, 3)."""
     found = np.zeros((len(points), directions.shape[1]), bool)
     for box in proxies:
         if box.shape == "box" and box.marker is None:

@@ -1,24 +1,24 @@
-"""The search for emitters: emitters or a sun within what clips, each with a direction, a distance and a power.
+"""Search for emitters within clipped light, such as lamps or the sun, each with a direction, a distance and a power.
 
-They are chosen one by one, among all directions that may lack light and a grid of distances, by how far they lower the
-cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest, then moved to
-neighbouring cells and distances while that helps, and along their direction to where the cost is least. They are kept
-if the cost falls by more than ``evidence``.
+Candidates are chosen one by one, among all directions that may miss light and a grid of distances, by their decrease of
+the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b). The best few are fitted fully, then moved to
+neighbouring cells and distances while the cost decreases, and along their direction to the least cost. They are kept if
+the cost decreases by more than ``evidence``.
 
-**Channels.** Each channel is fitted by itself: a candidate has a power of its own in each. What the equations leave
-over is nearly the same in all three: residuals of two channels correlate by 0.92 to 1.0 on four known desks, by 0.71
-and more where much clips. So they are three looks at one error. Where a candidate stands is told by the mean of their
-costs, not by the sum. Whether there is one is told by the median of what falls: two channels say so, each for itself.
-Where points or light clip a channel its cost hardly falls; what one channel alone says is outvoted.
+**Channels.** Each channel is fitted separately, with its own power of each candidate. Residuals are nearly the same in
+all three: those of two channels correlate by 0.92 to 1.0 on four known desks, and by 0.71 or more where much clips. So
+they are three measurements of one error. The place of a candidate is chosen by the mean of the three costs, not by
+their sum. Its existence is decided by the median of their decreases, so that two channels must confirm it. If points or
+light clip in a channel, its cost hardly decreases; a single channel is outvoted.
 
-**Distances.** How far an emitter stands is told by its light falling off, and often hardly: costs of one lamp of the
-clip ``desk`` differ by less than one from 0.3 m to 1.2. A near one changes all that stands off the ball. Emitters stand
-anywhere in a room, and beyond d times as far there is d^3 times as much of it in the same directions and steps of
-distance in proportion; so from each cost
+**Distances.** The distance of an emitter is determined by the falloff of its light, often weakly: the costs of a lamp
+in the clip ``desk`` differ by less than one between 0.3 m and 1.2 m. A near emitter changes the light of all points
+away from the ball. Emitters may be anywhere in a room, and a cell of directions and relative distance has a volume
+proportional to d^3. So each cost is reduced by
 
     2 log d^3 = 6 log d
 
-is taken away, with d no more than ``farthest``. Where falling off tells distance within a tenth, that moves it by 3 %.
+with d at most ``farthest``. If the falloff determines the distance within a tenth, this moves it by 3 %.
 """
 
 from __future__ import annotations
@@ -36,32 +36,32 @@ Array = NDArray[np.float64]
 
 
 STEP = 1.1
-"""Ratio of neighbouring distances that are tried."""
+"""Ratio of neighbouring trial distances."""
 MOST_STEPS = 4
-"""Largest number of steps from the end of a search."""
+"""Largest number of such steps from the result of the grid search."""
 
 
 def room(distance: float) -> float:
-    """Twice the logarithm of how much room there is about a distance (metres), but for a constant."""
+    """Return twice the logarithm of the prior volume at a distance in metres, up to a constant."""
     return 6.0 * float(np.log(min(distance, CONFIG.search.farthest)))
 
 
 class EmitterSearch:
-    """Adds emitters to a problem's unknowns and moves them, by all channels."""
+    """Adds emitters to a problem's unknowns and moves them, using all channels."""
 
     def __init__(self, problem: Problem, means: Array) -> None:
-        """Look for emitters of ``problem``, from what the card alone has its channels lack, ``means`` (3,)."""
+        """Start a search for emitters of ``problem``; ``means`` (3,) are the common means by the card alone."""
         self.problem, self.means = problem, means
         search = CONFIG.search
         self.evidence = search.evidence * max(problem.texture / search.even, 1.0) ** search.textured
-        """Fall of the cost that an emitter must be worth here: on textured surfaces stains look like shadows."""
+        """Least decrease of the cost for an emitter; larger on textured surfaces, because stains look like shadows."""
 
     def fit_anew(self) -> Fits:
-        """Fit all channels from what the card alone has them."""
+        """Fit all channels, starting from the solution by the card alone."""
         return fit_channels(self.problem, self.problem.start(self.means), CONFIG.solver.iterations)
 
     def gains(self, fits: Fits, columns: Array) -> Array:
-        """Fall of the costs, to second order, if each of ``columns`` (points, q) were a free unknown more, (3, q)."""
+        """Return second-order decreases of the costs by each of ``columns`` (points, q) as one more unknown, (3, q)."""
         equations, found = fits.equations, []
         for c in range(3):
             free = fits.z[c] > 0.0
@@ -75,7 +75,7 @@ class EmitterSearch:
         return np.array(found)
 
     def costs_at(self, places: Sequence[Candidate], fits: Fits) -> Array:
-        """Mean of the costs with one candidate more at each of some places, less how much room there is, (places,)."""
+        """Return the mean of the costs with one more candidate at each place, minus ``room``, (places,)."""
         z = np.insert(fits.z, self.problem.first_mean, 0.0, axis=1)
         tried = np.tile(z, (len(places), 1))
         light, iterations = self.problem.light_of(places), CONFIG.solver.warm_iterations
@@ -83,7 +83,7 @@ class EmitterSearch:
         return np.asarray(cost.reshape(-1, 3).mean(axis=1) - [room(place.distance) for place in places], np.float64)
 
     def add_candidate(self, fits: Fits, candidates: Sequence[Candidate], columns: Array) -> Fits | None:
-        """Add the best candidate if it is worth it; returns the new fits, or None."""
+        """Add the best candidate if the cost decreases enough; return the new fits, or None."""
         gain, tried = np.median(self.gains(fits, columns), axis=0), list[Candidate]()
         for place in np.argsort(-gain, kind="stable"):
             one = candidates[place]
@@ -104,9 +104,9 @@ class EmitterSearch:
         return added
 
     def settled(self, candidate: Candidate, cost: float, fits: Fits, least: float) -> Candidate:
-        """Return the best place near a candidate that is not among the unknowns of ``fits`` and would lead to ``cost``.
+        """Return the best place near a candidate that is not among the unknowns of ``fits`` and has the cost ``cost``.
 
-        A step must lower the cost by more than ``least``.
+        A step must decrease the cost by more than ``least``.
         """
         for _ in range(2):
             around = self.neighbours(candidate)
@@ -119,24 +119,24 @@ class EmitterSearch:
         if self.problem.trace is not None:
             others = [Candidate(candidate.cell, distance) for distance in (np.inf, *CONFIG.search.distances)]
             candidate, cost = self._best_of(others, candidate, cost, fits, least)
-        # Costs that differ by less than one standard deviation tell no distance.
+        # Costs that differ by less than one standard deviation do not determine the distance.
         return self._at_its_distance(candidate, cost, fits, max(least, CONFIG.search.worth_moving))
 
     def _best_of(
         self, places: Sequence[Candidate], candidate: Candidate, cost: float, fits: Fits, least: float
     ) -> tuple[Candidate, float]:
-        """The best of some places and its cost; the candidate itself where none lowers that by more than ``least``."""
+        """Return the best place and its cost; the candidate itself if none decreases it by more than ``least``."""
         for place, other in zip(places, self.costs_at(places, fits), strict=True):
             if other < cost - least:
                 candidate, cost = place, float(other)
         return candidate, cost
 
     def _at_its_distance(self, candidate: Candidate, cost: float, fits: Fits, least: float) -> Candidate:
-        """The candidate where, along its direction, the cost is least.
+        """Return the candidate at the distance of least cost along its direction.
 
-        The second order, by which ``settled`` chooses what it tries, is taken far from a solution with the candidate:
-        of distances it may name the wrong ones. Here every place is tried: steps of ``STEP`` downhill while they gain
-        more than ``least``, then the bottom of the parabola through the last three.
+        The second-order decrease by which ``settled`` chooses places is inaccurate far from a solution with the
+        candidate, and may prefer wrong distances. Here every place is evaluated: steps of ``STEP`` downhill while they
+        decrease the cost by more than ``least``, then the minimum of the parabola through the last three.
         """
         if self.problem.trace is None or not np.isfinite(candidate.distance):
             return candidate
@@ -166,7 +166,7 @@ class EmitterSearch:
         return between if self.costs_at([between], fits)[0] < middle - least else place(best)
 
     def move_candidate(self) -> None:
-        """Move the first candidate to where it does better, if that is nearby; it becomes the last."""
+        """Move the first candidate to a better place nearby, if there is one; it becomes the last candidate."""
         candidate = self.problem.candidates.pop(0)
         self.problem.candidate_columns = self.problem.candidate_columns[:, :, 1:]
         fits = self.fit_anew()
@@ -174,7 +174,7 @@ class EmitterSearch:
         self.problem.push(self.settled(candidate, cost, fits, CONFIG.search.worth_moving))
 
     def neighbours(self, candidate: Candidate) -> list[Candidate]:
-        """Candidates in cells nearby, and at distances nearby."""
+        """Return candidates in adjacent cells and at neighbouring distances."""
         close = np.flatnonzero(
             (self.problem.direction @ self.problem.direction[candidate.cell] > np.cos(0.2))
             & self.problem.may_hold_candidate

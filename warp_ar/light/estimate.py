@@ -1,22 +1,23 @@
-"""Results of recovery, and their course over time.
+"""Results of the recovery, and their averaging over time.
 
-**Stillness.** While the light is as it was, the last estimate holds and nothing is solved for.
+**Stillness.** While the light is unchanged, the last estimate holds and nothing is solved.
 
-**Steadiness.** While the light stays as it is, estimates are averaged, so that noise of single frames does not flicker.
-An estimate of one frame scatters as noise moves surfaces, decides over points at a threshold, or splits what clips to
-other regions. Over n estimates of the same light the mean scatters by n^-1/2 of that, and a new one moves it by 1 / n.
+**Steadiness.** While the light is unchanged, estimates are averaged, so that noise of single frames does not flicker.
+Estimates of single frames scatter, because noise shifts surfaces, moves points across a threshold, or splits clipped
+cells into other regions. The mean of n estimates of the same light scatters by n^-1/2 of that, and a new estimate moves
+it by 1 / n.
 
-Let m be the relative change, of surfaces or of the environment, between the light that the mean was made from, its own
-mean, and that which is seen now; or the angle, in radians, between the directions from which the ball is seen, if that
-is more: from elsewhere what clips lies in other cells, and the mean over them is neither. A new estimate has the weight
+Let m be the relative change of the light since the mean, on surfaces or in the environment. If it is larger, take the
+angle in radians between the current direction and the mean's direction from the ball to the camera instead: seen from
+elsewhere, clipped light lies in other cells, and a mean over both views fits neither. A new estimate has the weight
 
     w = max((m / still)^2, 1 / n), at most 1.
 
-Light that has changed by ``still`` is followed at once. What a mean errs by for its lag is m^2, as a variance; and
-noise alone looks like a change by a quarter of ``still``, which so counts for little. Light that changes by r from one
-estimate to the next runs ahead of its mean by m = r / w = (r still^2)^1/3, which is less than ``still``.
+Light that has changed by ``still`` is followed at once. The lag of a mean has the error m^2, as a variance. Noise alone
+looks like a change by a quarter of ``still``, which thus has little weight. If the light changes by r between
+estimates, the mean lags by m = r / w = (r still^2)^1/3, which is less than ``still``.
 
-Emitters that were found, lost or moved are other light: then the mean begins anew.
+Emitters that were found, lost or moved are a change of the light: then the mean starts anew.
 """
 
 from __future__ import annotations
@@ -33,50 +34,50 @@ from warp_ar.light.evidence import NO_CARD, CardCheck, Interval
 
 @dataclasses.dataclass(frozen=True)
 class FoundEmitter:
-    """A source of light that was found by what it does."""
+    """Light source found by its effect on surfaces."""
 
     origin: NDArray[np.float64]
-    """Point of the ball in which the camera sees it mirrored, metres, (3,)."""
+    """Point of the ball at which the camera sees its reflection, metres, (3,)."""
     direction: NDArray[np.float64]
-    """Unit, from there, (3,)."""
+    """Unit direction from ``origin``, (3,)."""
     distance: float
-    """Metres from there; infinite where none was found."""
+    """Distance from ``origin``, metres; infinite if none was found."""
     power: NDArray[np.float64]
-    """Radiance times solid angle as seen from the ball, per channel, beyond what the map shows, (3,)."""
+    """Radiance times solid angle as seen from the ball, per channel, in addition to the map's, (3,)."""
     cell: int = -1
-    """Number of the cell that it stands in, where it was found in one."""
+    """Index of its cell in the map; -1: none."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """Light that clipping took, as far as one frame tells."""
+    """Recovered light, as far as one frame determines it."""
 
     recovered: NDArray[np.float32]
-    """Radiance that a wholly clipped texel lacks, (rows, columns, 3) of cells."""
+    """Missing radiance of a wholly clipped texel, (rows, columns, 3) of cells."""
     lower_bound: tuple[bool, bool, bool]
-    """Channels in which the card clips or is not seen: there the total is a lower bound, or rests on priors."""
+    """Channels in which the card clips or is not visible: the total is then a lower bound, or depends on priors."""
     emitters: tuple[FoundEmitter, ...] = ()
     """Emitters, the most powerful first."""
     method: str = "clipped"
-    """Method: the one that was asked for, or the one that is left. ``least``: no card is seen,
-    and what clips is raised by what nearly every place lacks."""
+    """Method used: the requested one or a fallback. ``least``: no card is visible, and clipped light is raised by the
+    amount that is missing in nearly every scene."""
     factor: float = 0.0
-    """Share of the method's own solution that evidence allows, 0 to 1; ``recovered`` and ``emitters`` hold it."""
+    """Share of the method's solution that the evidence allows, 0 to 1; ``recovered`` and ``emitters`` include it."""
     card: CardCheck = NO_CARD
     """Evidence that the card is in the picture."""
     card_share: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Share of the card's light, by channel, that the captured map lacks; 0 without evidence of the card."""
+    """Share of the card's irradiance, by channel, that the captured map lacks; 0 without evidence of the card."""
     irradiance: Interval | None = None
     """Interval of the irradiance from all directions."""
 
     @property
     def is_finite(self) -> bool:
-        """True where all that it puts into the map is finite."""
+        """Return True if all values that it adds to the map are finite."""
         powers = all(bool(np.isfinite(emitter.power).all()) for emitter in self.emitters)
         return powers and bool(np.isfinite(self.recovered).all())
 
     def report(self) -> dict[str, Any]:
-        """Return what it rests on, as reports list it."""
+        """Return the evidence for the estimate, in the form of reports."""
         emitters = [
             {
                 "direction": [round(float(x), 4) for x in emitter.direction],
@@ -104,18 +105,18 @@ Array = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """The light that a frame shows: of the environment, and on surfaces."""
+    """Light observed in a frame: of the environment, and on surfaces."""
 
     environment: Array
     """Radiance times solid angle of cells, (rows, columns, 3)."""
     shown: Array
     """Radiance of surface points, mean of channels, (n,)."""
     told: NDArray[np.bool_]
-    """Points that are seen and neither clip nor are dark, (n,)."""
+    """Visible points that are neither clipped nor dark, (n,)."""
 
     @classmethod
     def of(cls, cells: NDArray[Any], observations: NDArray[Any]) -> Seen:
-        """From one frame.
+        """Return the light observed in one frame.
 
         Args:
             cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
@@ -128,11 +129,11 @@ class Seen:
         return cls(environment, shown, told)
 
     def change(self, before: Seen) -> float | None:
-        """Relative change since then; None where no surface tells."""
+        """Return the relative change of the light since ``before``; None if no surface measures it."""
         both = self.told & before.told
         if not both.any():
             return None
-        # The sum of what changed, not of changes: which of two cells sees a window's edge varies by itself.
+        # Change of the sum, not sum of the changes: light at the edge of a window alternates between two cells.
         total = max(self.environment.sum(axis=(0, 1)).max(), 1e-9)
         moved = np.abs((self.environment - before.environment).sum(axis=(0, 1))).max() / total
         ratio = np.log(self.shown[both] / before.shown[both])
@@ -140,20 +141,20 @@ class Seen:
 
 
 class Stillness:
-    """Tells whether the light is that of the last estimate.
+    """Detects whether the light is that of the last estimate.
 
-    While it is, each estimate lets twice as many turns pass as the one before.
+    While it is, each new estimate waits twice as many turns as the one before.
     """
 
     def __init__(self) -> None:
-        """Remember nothing."""
+        """Start without a last estimate."""
         self._rested, self._patience = 0, 1
         self._seen: Seen | None = None
 
     def holds(self, cells: NDArray[Any], observations: NDArray[Any], *, settled: bool) -> bool:
-        """Return whether the last estimate still holds, as far as the light tells.
+        """Return True if the last estimate still holds, by the change of the light.
 
-        Takes note of what it is given, unless it holds.
+        If not, the given light is remembered as that of the next estimate.
 
         Args:
             cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
@@ -176,22 +177,22 @@ class Stillness:
 
 
 class Steadiness:
-    """The mean of estimates, and what they were made from."""
+    """Running mean of estimates, with the light that they were made from."""
 
     def __init__(self) -> None:
-        """Remember nothing."""
+        """Start without estimates."""
         self._seen: Seen | None = None
         self._view = np.zeros(3)
         self._mean: Estimate | None = None
         self._count = 0
 
     def follow(self, estimate: Estimate, seen: Seen, view: NDArray[np.float64]) -> Estimate:
-        """The mean with one estimate more.
+        """Return the mean including one more estimate.
 
         Args:
-            estimate: Of the frame.
-            seen: What it was made from.
-            view: Direction from the ball to the camera, unit, (3,).
+            estimate: Estimate of the frame.
+            seen: Light that the frame showed.
+            view: Unit direction from the ball to the camera, (3,).
         """
         weight = self._weight(estimate, seen, view)
         if weight >= 1.0 or self._mean is None or self._seen is None:
@@ -214,12 +215,12 @@ class Steadiness:
 
 
 def _powers(estimate: Estimate) -> dict[tuple[int, float], NDArray[np.float64]]:
-    """Power of emitters by where they stand."""
+    """Return the power of emitters by their cell and distance."""
     return {(emitter.cell, emitter.distance): emitter.power for emitter in estimate.emitters}
 
 
 def _mixed_seen(before: Seen, now: Seen, weight: float) -> Seen:
-    """A mean of what was seen; points that come into view begin as they are."""
+    """Return a mean of observed light; points that come into view start with their current value."""
     shown = np.where(before.told & now.told, before.shown + weight * (now.shown - before.shown), now.shown)
     shown = np.where(before.told & ~now.told, before.shown, shown)
     environment = before.environment + weight * (now.environment - before.environment)
@@ -227,7 +228,7 @@ def _mixed_seen(before: Seen, now: Seen, weight: float) -> Seen:
 
 
 def _mixed(mean: Estimate, now: Estimate, weight: float) -> Estimate:
-    """A mean of light and powers; all else is of the newer, so are cells that begin to lack light or cease to."""
+    """Return a mean of light and powers; other fields, and cells that start or stop missing light, are the newer's."""
     both = (mean.recovered > 0.0) & (now.recovered > 0.0)
     recovered = np.where(both, mean.recovered + weight * (now.recovered - mean.recovered), now.recovered)
     powers, emitters = _powers(mean), []

@@ -1,12 +1,12 @@
-"""Evidence of the card: that it is in the picture, how far its white is believed, how much light it leaves open.
+"""Evidence of the card: whether it is in the picture, how reliable its white is, and bounds on the missing light.
 
-The card's white is the one reflectance that is known. A table, a stool or a hand may stand where the card is expected.
-Print tells: ink is a tenth as bright as the paper beside it or darker, in any light that both receive. White cells and
-ink cells lie next to each other all over the print, so that the ratio of an ink cell to its nearest white ones does not
-depend on shadows or falling off.
+The card's white is the only known reflectance, but a table, a stool or a hand may be where the card is expected. Its
+print identifies it: ink is at most a tenth as bright as the adjacent paper in any light that both receive. White cells
+and ink cells are adjacent all over the print, so the ratio of an ink cell to its nearest white cells does not depend on
+shadows or on the falloff of light.
 
-Paper is at most some thirty times as bright as the ink on it. Where it looks brighter still, the response is steeper
-than it is taken to be, as an S-shaped tone curve makes it, and the card is doubted by as much.
+Paper is at most thirty times as bright as its ink. A larger ratio shows that the response is steeper than assumed, for
+example S-shaped, and reduces the confidence in the card accordingly.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ Array = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class CardCheck:
-    """Evidence of a card."""
+    """Result of the test whether the card is in the picture."""
 
     contrast: float
-    """Median ratio of paper to the ink beside it; 0 where too little of either is seen."""
+    """Median ratio of paper to adjacent ink; 0 if too little of either is visible."""
     share: float
-    """Share of ink cells that are clearly darker than the paper beside them, 0 to 1."""
+    """Share of ink cells that are clearly darker than the adjacent paper, 0 to 1."""
 
     @property
     def holds(self) -> bool:
-        """True where the card is in the picture."""
+        """Return True if the card is in the picture."""
         config = CONFIG.card
         return self.contrast >= config.least_contrast and self.share >= config.least_share
 
 
 NO_CARD = CardCheck(0.0, 0.0)
-"""Nothing speaks for one."""
+"""Result without any evidence of a card."""
 
 
 def check_card(points: Array, kind: NDArray[np.int64], light: Array) -> CardCheck:
-    """Compare ink with the paper beside it.
+    """Compare ink with the adjacent paper.
 
     Args:
-        points: Places of the surface points that are seen, metres, (n, 3).
-        kind: ``Kind`` of the surface that each lies on, (n,).
-        light: pi times the radiance that each shows, (n, 3); where it clips, the level of clipping: ink is then darker
-            still beside the paper than it looks.
+        points: Positions of the visible surface points, metres, (n, 3).
+        kind: ``Kind`` of each point's surface, (n,).
+        light: pi times the radiance of each point, (n, 3); the clipping level where it clips, which underestimates the
+            contrast of paper to ink.
     """
     config = CONFIG.card
     paper, ink = np.flatnonzero(kind == Kind.CARD), np.flatnonzero(kind == Kind.INK)
@@ -63,10 +63,10 @@ def check_card(points: Array, kind: NDArray[np.int64], light: Array) -> CardChec
 
 
 def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArray[np.bool_]:
-    """Return the points of paper and ink that something covers, (n,); none where hardly any paper would be left.
+    """Return the points of paper and ink that something covers, (n,); none if hardly any paper would be left.
 
-    A hand over a part of the card covers paper and the ink beside it, and is as bright where one is as where the other
-    is. A shadow darkens both, and their ratio stays.
+    A hand over a part of the card covers paper and adjacent ink, and has the same brightness on both. A shadow darkens
+    both, but keeps their ratio.
 
     Args:
         points: As for ``check_card``.
@@ -89,10 +89,10 @@ def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArra
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Irradiance of surfaces that face along the axes, at the ball's place, with the map's light put right."""
+    """Corrected irradiance at the ball's place for the six axis directions, with its interval."""
 
     normals: Array
-    """+x, -x, +y, -y, +z, -z, (6, 3)."""
+    """Surface normals +x, -x, +y, -y, +z, -z, (6, 3)."""
     low: Array
     """Lower end of the 95 % interval, (6, 3: channels)."""
     value: Array
@@ -102,7 +102,7 @@ class Interval:
 
 
 def doubt_of(contrast: float) -> float:
-    """Standard deviation of the card's logarithm, by the ratio of its paper to its ink."""
+    """Return the standard deviation of the logarithm of the card's radiance, given its ratio of paper to ink."""
     config = CONFIG.evidence
     return float(np.hypot(config.white, config.doubt * np.log(max(contrast / config.usual_contrast, 1.0))))
 
@@ -113,13 +113,13 @@ def irradiance_form(problem: Problem, normals: Array) -> Array:
 
 
 def greyer(contrast: float, white: float) -> float:
-    """Return the factor by which light may exceed what the card says, for paper that is greyer than stated: at least 1.
+    """Return the factor by which light may exceed the card's estimate if the paper is greyer than stated; at least 1.
 
-    Paper over ink is their contrast; print is usually of so much reflectance.
+    The reflectance of paper is its contrast times that of ink, and prints have a usual reflectance of ink.
 
     Args:
-        contrast: Of paper that does not clip to the ink beside it.
-        white: Reflectance that the paper is said to have.
+        contrast: Ratio of unclipped paper to adjacent ink.
+        white: Stated reflectance of the paper.
     """
     return max(white / (contrast * CONFIG.surfaces.reflectance[Kind.INK]), 1.0) if contrast > 0.0 else 1.0
 
@@ -133,20 +133,20 @@ def irradiance_interval(
     known: bool,
     contrast: float = 0.0,
 ) -> Interval:
-    """Between which bounds the irradiance at the ball's place lies.
+    """Return the interval of the irradiance at the ball's place.
 
-    What the ball shows errs by ``capture`` to one side and ``overlooked`` to the other. What an estimate found scatters
-    as its draws do, and where part of it was held back the whole of it, and as much again, may be there. Paper may be
-    greyer than it is said to be (``greyer``). Where no draws were made, or the card only bounds what is missing, all
-    that clips may be as bright as ``clipped``.
+    Captured irradiance may be too high by ``capture`` and too low by ``overlooked``. An estimate has the spread of its
+    draws; if only a part of it was applied, the whole and as much again may be present. Paper may be greyer than stated
+    (``greyer``). Without draws, or if the card gives only a lower bound, all clipped light may be as bright as
+    ``clipped``.
 
     Args:
         problem: The equations.
-        recovered: An estimate's solution, (cells, 3).
-        factor: Share of it that is taken, 0 to 1.
+        recovered: Solution of the estimate, (cells, 3).
+        factor: Share of the solution that is applied, 0 to 1.
         bounds: Channels in which it is a lower bound.
-        known: Whether surfaces tell where the light comes from.
-        contrast: Of the card's print; 0: no card is seen.
+        known: Whether surfaces determine the directions of the light.
+        contrast: Paper to ink ratio of the card; 0: no card is visible.
     """
     config = CONFIG.evidence
     normals = np.array([[s if k == axis else 0.0 for k in range(3)] for axis in range(3) for s in (1.0, -1.0)])
@@ -162,16 +162,16 @@ def irradiance_interval(
 
 
 def most_by_card(problem: Problem, recovered: Array, bounds: tuple[bool, bool, bool], doubt: float) -> float:
-    """Return the factor on a solution, 0 to 1, by which its share of all light is in keeping with the card's.
+    """Return the factor on a solution, 0 to 1, that limits its share of all light by the share missing at the card.
 
-    Light from the side, or from below, hardly lights the card; surfaces that say it is there are textured and of
-    unknown reflectance. Where the card shows little missing, it is little elsewhere, within ``lever``.
+    Light from the side or from below hardly reaches the card, and the surfaces that measure it are textured and of
+    unknown reflectance. If little is missing at the card, little is missing elsewhere, within the ratio ``lever``.
 
     Args:
         problem: The equations.
-        recovered: Radiance that cells lack, (cells, 3).
-        bounds: Channels in which the card clips, and says nothing.
-        doubt: Standard deviation of the card's logarithm.
+        recovered: Missing radiance of cells, (cells, 3).
+        bounds: Channels in which the card clips and is not used.
+        doubt: Standard deviation of the logarithm of the card's radiance.
     """
     lacking = problem.solid_angle @ problem.missing
     told = [c for c in range(3) if lacking[c] > 0.3 * lacking.max() and not bounds[c]]

@@ -1,10 +1,11 @@
-"""The solution of the equations: iteratively reweighted least squares with unknowns that are not negative.
+"""Solution of the equations: iteratively reweighted least squares with non-negative unknowns.
 
-All channels are solved at once, each with every candidate that is tried: arrays begin with the number of the fit, whose
-channel is that number modulo 3. Products of one fit take microseconds, about as long as a call of NumPy.
+All channels are solved at once, and for each channel every tried candidate. The first axis of an array is the index of
+the fit; its channel is that index modulo 3. The matrix products of one fit take microseconds, about as long as a call
+of NumPy.
 
-Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
-without it, the more parts and equations there are, the more all of them would shrink together.
+Each deviation is relative to an unknown, a mean or a reflectance. The derivative keeps the dependence on that scale:
+without it, all scales would shrink together, the more so the more parts and equations there are.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Array = NDArray[np.float64]
 
 @functools.cache
 def _blas() -> ThreadpoolController:
-    """Find the libraries; that takes as long as four fits."""
+    """Return the controller of the BLAS libraries; finding them takes as long as four fits."""
     return ThreadpoolController()
 
 
@@ -36,7 +37,7 @@ _ALONE = threading.Lock()
 
 
 def _renew_lock() -> None:
-    """Let a fork solve although its parent was solving."""
+    """Replace the lock in a forked process, whose parent may hold it."""
     global _ALONE
     _ALONE = threading.Lock()
 
@@ -46,10 +47,10 @@ os.register_at_fork(after_in_child=_renew_lock)
 
 @contextlib.contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Keep NumPy's BLAS to one thread: products here take microseconds, and waking threads for them more.
+    """Limit NumPy's BLAS to one thread: products here take microseconds, and waking threads takes longer.
 
-    The number belongs to the process, so that one solution is made at a time; sums in another order would be another
-    picture.
+    The limit belongs to the process, so one solution is computed at a time. The number of threads must not vary:
+    another order of summation would give another picture.
     """
     with _ALONE, _blas().limit(limits=1, user_api="blas"):
         yield
@@ -58,13 +59,13 @@ def one_blas_thread() -> Iterator[None]:
 def solve_nonnegative(hessian: Array, gradient: Array, start: Array | None = None) -> Array:
     """Minimise x' H x / 2 - g' x over x >= 0, for several problems at once.
 
-    Block pivoting: free unknowns that turn negative are held at zero; once none does, held ones that pull upward are
-    let go.
+    Method: block pivoting. Free unknowns that become negative are fixed at zero; when none does, fixed unknowns with an
+        upward gradient are freed.
 
     Args:
         hessian: H, positive definite, (problems, n, n).
         gradient: g, (problems, n).
-        start: Solutions of similar problems: their positive unknowns start free.
+        start: Solutions of similar problems; their positive unknowns start free.
     """
     free = np.ones(gradient.shape, bool) if start is None else start > 0.0
     tolerance = 1e-9 * np.abs(gradient).max(axis=1, initial=0.0, keepdims=True)
@@ -88,45 +89,45 @@ LEAST = CONFIG.priors.least
 
 @dataclasses.dataclass
 class Fits:
-    """Solutions, and the quadratic problems that they solve."""
+    """Solutions of several fits, with the quadratic problems that they solve."""
 
     z: Array
-    """Unknowns, in the order that ``Problem`` gives, (fits, unknowns)."""
+    """Unknowns, in the order of ``Problem``, (fits, unknowns)."""
     cost: Array
-    """Twice a negative log likelihood, (fits,)."""
+    """Twice the negative log likelihood, (fits,)."""
     equations: Equations
-    """Both sides."""
+    """Equations that were solved."""
     off: Array
-    """Left sides less right ones, (fits, rows)."""
+    """Residuals, left side minus right side, (fits, rows)."""
     weights: Array
     """Weights of the last quadratic problem, (fits, rows)."""
     hessian: Array
-    """The same, priors included, (fits, unknowns, unknowns)."""
+    """Hessian of the last quadratic problem, priors included, (fits, unknowns, unknowns)."""
 
 
 @dataclasses.dataclass
 class _State:
-    """Unknowns, and what a quadratic problem about them takes."""
+    """Unknowns, with residuals, deviations and cost at them."""
 
     z: Array
     u: Array
-    """1 / reflectance of surfaces, (fits, surfaces)."""
+    """Reciprocal reflectance of surfaces, (fits, surfaces)."""
     off: Array
     relative: Array
-    """The same over their standard deviation; 0 where a point that clips may be as bright, (fits, rows)."""
+    """Residuals over their standard deviation, (fits, rows); 0 where a clipped point may be as bright as predicted."""
     deviation: Array
     """Standard deviations of priors, (fits, priors)."""
     strayed: Array
-    """Deviations from priors over these, (fits, priors)."""
+    """Deviations from priors over their standard deviations, (fits, priors)."""
     cost: Array
 
 
 class Equations:
-    """Equations and priors of all channels, as matrices.
+    """Equations and priors of all channels, in a compact form of matrices.
 
-    An equation is light of parts and candidates less 1 / reflectance of its surface, so that with many surfaces nearly
-    all of a matrix would be zeros. What is kept is the light and the number of the surface: products take time in
-    proportion to equations, and not to equations times surfaces.
+    An equation contains the light of all parts and candidates, and the reciprocal reflectance of one surface. As a full
+    matrix it would be mostly zeros for many surfaces. Only the light and the surface's index are stored, so that the
+    time of products is proportional to the number of equations, not to equations times surfaces.
     """
 
     def __init__(
@@ -136,14 +137,14 @@ class Equations:
         centre: Array | None = None,
         known: tuple[Array, NDArray[np.bool_]] | None = None,
     ) -> None:
-        """Set up.
+        """Set up the equations and the priors.
 
         Args:
             problem: The equations.
-            added: Irradiance per power of candidates, each tried by itself beside those of the problem, (3, points, q).
-            centre: Draws parts and candidates to itself instead of to means, (3, parts + candidates).
-            known: 1 / reflectances by a channel that is known better, (surfaces,), and the channels in which surfaces
-                are of about these, (3,).
+            added: Irradiance per power of candidates, each tried separately besides the problem's own, (3, points, q).
+            centre: Values to which parts and candidates are drawn instead of the means, (3, parts + candidates).
+            known: Reciprocal reflectances from a better known channel, (surfaces,), and the channels in which they
+                apply approximately, (3,).
         """
         self.problem, self.centre, count = problem, centre, len(problem.kinds)
         card, exact = problem.kind == Kind.CARD, problem.exact.T
@@ -173,7 +174,7 @@ class Equations:
         self._set_priors()
 
     def _set_priors(self) -> None:
-        """Left and right sides of what parts, means and reflectances deviate from."""
+        """Set up the matrices of the priors on parts, means and reflectances."""
         problem, mean_at, at = self.problem, self.mean_at, self.surface_at
         self.prior = np.zeros((at + len(problem.ties), at + len(problem.kinds)))
         self.prior[:at, :at] = np.eye(at)
@@ -188,7 +189,7 @@ class Equations:
         self.prior[ties, at + problem.ties[:, 0]], self.prior[ties, at + problem.ties[:, 1]] = 1.0, -1.0
 
     def guess_reflectances(self, z: Array) -> None:
-        """Set the reflectances of surfaces to the medians over their points, by the light of unknowns."""
+        """Set the reflectance of each surface to the median over its points, in the light of the unknowns."""
         ratio = self._sum(z) - self.target
         z[:, self.surface_at :] = self.prior_u
         for c in range(3):
@@ -200,15 +201,15 @@ class Equations:
             z[c, self.surface_at + found[told]] = np.maximum(middle[told], 1e-3)
 
     def solve(self, z: Array, iterations: int) -> Fits:
-        """Reweight and solve in turn.
+        """Alternate between computing weights and solving the quadratic problem.
 
-        Steps are halved until they do not raise the cost above the least so far. Each quadratic problem has deviations
-        about the last unknowns. Where the card clips, little more than priors of reflectances bounds the light as a
-        whole, and whole steps may lead ever farther from the least cost.
+        A step is halved while it raises the cost above the least cost so far. Each quadratic problem uses deviations
+        about the last unknowns. Where the card clips, little but the priors on reflectances limits the total light, and
+        full steps may diverge from the least cost.
 
         Args:
             z: Unknowns to start from, (fits, unknowns).
-            iterations: Of reweighting.
+            iterations: Number of iterations of reweighting.
         """
         state = self._at(z)
         least = state.cost
@@ -225,11 +226,11 @@ class Equations:
         return Fits(z, state.cost, self, state.off, weights, hessian)
 
     def _sum(self, z: Array) -> Array:
-        """Light of parts and candidates, (fits, rows)."""
+        """Return the light of parts and candidates, (fits, rows)."""
         return np.asarray((self.light @ z[:, : self.mean_at, None])[..., 0], np.float64)
 
     def _at(self, z: Array) -> _State:
-        """Deviations about unknowns, and the cost."""
+        """Return residuals, deviations and cost at the given unknowns."""
         u, mean = np.maximum(z[:, self.surface_at :], 1e-3), z[:, self.surface_at - 1, None]
         off = self._sum(z) - u[:, self.surface] - self.target
         relative = off / (u[:, self.surface] * self.sigma)
@@ -241,7 +242,7 @@ class Equations:
         return _State(z, u, off, relative, deviation, strayed, cost)
 
     def _deviations(self, z: Array, u: Array, mean: Array) -> Array:
-        """Standard deviations of priors about unknowns."""
+        """Return the standard deviations of the priors about the given unknowns."""
         problem, priors, parts, mean_at = self.problem, CONFIG.priors, self.problem.parts, self.mean_at
         if self.centre is None:
             about = np.maximum(z[:, mean_at : self.surface_at - 1][:, problem.component], LEAST)
@@ -255,7 +256,7 @@ class Equations:
         return np.concatenate([of_parts, of_candidates, of_means, 3.0 * np.maximum(mean, LEAST), of_ties], axis=1)
 
     def _quadratic(self, state: _State) -> tuple[Array, Array, Array]:
-        """Hessian, gradient and the equations' weights about the last estimate."""
+        """Return Hessian, gradient and weights of the equations about the last estimate."""
         problem, mean_at, at = self.problem, self.mean_at, self.surface_at
         z, u, places = state.z, state.u, at + self.present
         weights = self.weigh / (1.0 + 0.25 * state.relative**2) / (u[:, self.surface] * self.sigma) ** 2
@@ -263,7 +264,7 @@ class Equations:
         scaled = self.prior.T / state.deviation[:, None] ** 2
         hessian = scaled @ self.prior
         gradient = (scaled @ self.target_prior[..., None])[..., 0]
-        # Log-normal prior of 1 / reflectance, about the last estimate.
+        # Log-normal prior on 1 / reflectance, about the last estimate.
         diagonal = np.arange(at, z.shape[1])
         hessian[:, diagonal, diagonal] += 1.0 / (u * self.spread_u) ** 2
         gradient[:, at:] += np.maximum(1.0 + np.log(self.prior_u / u), 0.2) / (u * self.spread_u**2)
@@ -274,7 +275,7 @@ class Equations:
         hessian[:, :mean_at, places] -= across.transpose(0, 2, 1)
         hessian[:, places, places] += self.by_surface(weights)
         gradient[:, :mean_at] += (self.target[:, None] @ weighted)[:, 0]
-        # Deviations are relative: what they are relative to must not shrink for their sake.
+        # Deviations are relative: this gradient keeps their scales from shrinking.
         gradient[:, places] += self.by_surface(weights * (state.off**2 / u[:, self.surface] - self.target))
         if self.centre is None:
             means, mean, strayed = z[:, mean_at : at - 1], z[:, at - 1], state.strayed[:, :at] ** 2
@@ -285,14 +286,14 @@ class Equations:
         return hessian, gradient, weights
 
     def transposed(self, c: int, values: Array) -> Array:
-        """Product of a channel's transposed matrix with ``values`` (rows, q), (unknowns, q)."""
+        """Return the product of a channel's transposed matrix and ``values`` (rows, q), (unknowns, q)."""
         product = np.zeros((self.prior.shape[1], values.shape[1]))
         product[: self.mean_at] = self.light[c].T @ values
         product[self.surface_at + self.present] = -self.by_surface(values[None])[0]
         return product
 
     def by_surface(self, values: Array) -> Array:
-        """Sums of rows' values over each surface that has any, (fits, present, ...)."""
+        """Return the sums of rows' values over each surface that has rows, (fits, present, ...)."""
         return np.add.reduceat(values, self.starts, axis=1) if len(self.starts) else values
 
 
@@ -304,13 +305,13 @@ def fit_channels(
     centre: Array | None = None,
     known: tuple[Array, NDArray[np.bool_]] | None = None,
 ) -> Fits:
-    """Solve for all channels from a start.
+    """Solve the equations of all channels.
 
     Args:
         problem: The equations.
-        z: Unknowns to start from, (fits, unknowns); surfaces may be left open, as 0.
-        iterations: Of reweighting.
-        added: As for `Equations`; there is a fit of each channel for each.
+        z: Unknowns to start from, (fits, unknowns); 0 for a surface without a start value.
+        iterations: Number of iterations of reweighting.
+        added: As for `Equations`; each candidate has a fit in each channel.
         centre: As for `Equations`.
         known: As for `Equations`.
     """

@@ -1,6 +1,6 @@
-"""Latlong maps in the axes of other programs: what files call them, and texels moved from one to another.
+"""Axes of latlong maps in other programs: names in files, and conversion between them.
 
-``output.environment_axes`` has the table of all axes, and cubes.
+``output.environment_axes`` has the table of all axes, and cube maps.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def world_from_marker(axes: str) -> Array:
-    """Rotation from the marker's axes to those of a file's world, (3, 3).
+    """Return the rotation from the marker's axes to those of a file's world, (3, 3).
 
     Raises:
-        UsageError: There are no axes of this name.
+        UsageError: The name of the axes is unknown.
     """
     _check(axes)
     return _Y_UP.copy() if axes in ("y-up", "opengl") else np.eye(3)
@@ -48,32 +48,32 @@ def _check(axes: str) -> None:
 
 
 def to_axes(radiance: Radiance, axes: str) -> Radiance:
-    """A latlong of this program in other axes, texel by texel.
+    """Return a latlong of this program in other axes, without interpolation.
 
     Args:
-        radiance: (height, width, 3), z-up.
+        radiance: Latlong map, z-up, (height, width, 3).
         axes: One of ``AXES``.
 
     Returns:
-        The same shape.
+        The converted map, of the same shape.
 
     Raises:
-        UsageError: There are no such axes, or a quarter of the map is no whole number of columns.
+        UsageError: The axes are unknown, or a quarter of the map is not a whole number of columns.
     """
     _check(axes)
     if axes == "z-up":
         return radiance
-    mirrored = radiance[:, ::-1]  # columns grow toward -y, the centre stays between the two middle ones
+    mirrored = radiance[:, ::-1]  # columns now grow toward -y; the centre stays between the two middle columns
     return np.ascontiguousarray(np.roll(mirrored, _quarter(mirrored, axes), 1))
 
 
 def from_axes(radiance: Radiance, axes: str) -> Radiance:
-    """Return a latlong in other axes as this program's own; arguments as `to_axes`.
+    """Return a latlong in other axes converted to this program's; arguments as for `to_axes`.
 
-    A map of which a quarter is half a column more than a whole number is interpolated by half a texel.
+    If a quarter of the map is a whole number of columns and a half, the map is interpolated by half a texel.
 
     Raises:
-        UsageError: There are no such axes, or the map's columns are an odd number.
+        UsageError: The axes are unknown, or the number of columns is odd.
     """
     _check(axes)
     if axes == "z-up":
@@ -86,20 +86,20 @@ def from_axes(radiance: Radiance, axes: str) -> Radiance:
 
 
 def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error: type[WarpArError], label: str) -> str:
-    """Return the axes that a latlong file is read in, and say which were taken where the file does not.
+    """Return the axes of a latlong file; print them if they are assumed.
 
-    An OpenEXR may say so in its attribute ``axes``. Else an OpenEXR, with or without ``envmap``, has that format's own
-    convention, y-up; Radiance's format has none, and those files are read as Blender and three.js do.
+    An OpenEXR can state them in its attribute ``axes``. Without it, an OpenEXR has the convention of its format, y-up,
+    with or without ``envmap``. Radiance's format has no convention; its files are read as by Blender and three.js.
 
     Args:
-        picture: The file, as `read_linear_picture` gave it.
-        path: The file.
-        asked: Axes that the user says it has, or None.
+        picture: Content of the file, from `read_linear_picture`.
+        path: Path of the file.
+        asked: Axes stated by the user; None: not stated.
         error: Class of the error to raise.
         label: Name of the file in messages.
 
     Raises:
-        WarpArError: As ``error``: it holds the faces of a cube, or its attribute says axes that are not known.
+        WarpArError: As ``error``: the file has the faces of a cube, or its attribute names unknown axes.
     """
     if picture.header.get("envmap") == OpenEXR.ENVMAP_CUBE:
         raise error(f"{label} holds the faces of a cube; a latlong is needed")
@@ -119,9 +119,9 @@ def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error
 
 
 def _quarter(radiance: Radiance, axes: str) -> int:
-    """Columns by which a map that is centred on +x must go right to be centred as ``axes`` say.
+    """Return the columns to shift a map centred on +x to the right, so that it is centred as ``axes`` need.
 
-    ``y-up`` is centred on -y of the marker, which the map holds a quarter right of +x; ``opengl`` on +y.
+    ``y-up`` is centred on -y of the marker, a quarter of the map right of +x; ``opengl`` is centred on +y.
     """
     if axes == "blender":
         return 0

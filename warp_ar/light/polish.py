@@ -1,19 +1,19 @@
-"""Reflection of the surroundings in a table, measured from frames from several sides.
+"""Reflectance and roughness of a polished table, measured from frames from several sides.
 
-A matt point has one radiance from wherever it is looked at. A polished one adds what it mirrors, which is another part
-of the environment from each side, and passes less of what it scatters:
+A matt point has the same radiance from every side. A polished one adds its reflection, which is another part of the
+environment from each side, and scatters less of the light:
 
     I_k(x) = (1 + e_k) D(x) + g F_k(x) (L_k(x) - D(x)) + h H_k(x),
 
-I_k the radiance of point x in view k, D what is scattered, e_k drift of the exposure, F_k L_k the environment over a
-GGX lobe by Fresnel for a reflectance of ``USUAL``. Light that clips in the ball is known by its place alone: it is H,
-of a strength h of its own. D is the point's mean over the views: so no texture can be taken for a reflection, and
-nothing need be smooth. g is 0 for a matt table and 1 for lacquer; it is found by least squares, robustly, for several
-widths of the lobe. Near its rim the ball's picture is less sharp than a polished table's, so the width found is often
-too small: the next one is held possible.
+I_k is the radiance of point x in view k, D the scattered radiance, e_k the drift of the exposure, and F_k L_k the
+environment filtered by a GGX lobe with Fresnel's factor for the reflectance ``USUAL``. H is light that clips in the
+ball, of which only the direction is known; it has a strength h of its own. D is the mean of the point over the views,
+so that texture cannot be taken for a reflection and nothing need be smooth. g is 0 for a matt table and 1 for lacquer.
+It is found by robust least squares for several widths of the lobe. Near its rim the ball's image is less sharp than a
+polished table's, so that the best width is often too small; the next larger one is accepted as possible.
 
-The environment turned about the vertical must explain clearly less: what moves with the camera for another reason, a
-lens that darkens its corners or what stands on the table, does not know where the room's windows are.
+The environment rotated about the vertical must explain clearly less. Other effects that move with the camera, such as
+the lens's vignetting or objects on the table, do not depend on the true directions of the light.
 
 References:
     [DB23] Dupuy, Benyoub 2023, Sampling Visible GGX Normals with Spherical Caps.
@@ -38,39 +38,39 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 USUAL: Final = 0.04
-"""Reflectance, seen from ahead, of lacquer, glass and varnish."""
+"""Reflectance at normal incidence of lacquer, glass and varnish."""
 ROUGHNESS: Final = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45)
-"""Widths that are tried."""
+"""Roughnesses to try."""
 CLIPPED: Final = 245
-"""Code from which on a point is not looked at."""
+"""Code from which a point counts as clipped and is not used."""
 HOT: Final = 0.77
-"""Camera value at the ball, from which on light may have been clipped."""
+"""Camera value at the ball from which light may have been clipped."""
 VIEWS: Final = 3
-"""Views in which a point must be seen."""
+"""Least number of views in which a point must be visible."""
 FEWEST: Final = 150
-"""Points that must tell."""
+"""Least number of usable points."""
 ACROSS: Final = 70
-"""Points across the part of the table that is looked at."""
+"""Number of points across the examined part of the table."""
 REACH: Final = 0.6
-"""Half of that part, metres, around the scene's origin."""
+"""Half width of that part, metres, around the scene's origin."""
 RAYS: Final = 12
 """Rays per point and view."""
 TURNS: Final = 7
-"""Turned environments that are tried."""
+"""Number of rotated environments to compare with."""
 ROUNDS: Final = 6
-"""Rounds of reweighting."""
+"""Iterations of reweighting."""
 GAIN: Final = 0.06
-"""Share of the differences between views that must be explained: matt tables leave 0.01 at most to chance."""
+"""Least share of the differences between views that must be explained: for matt tables chance explains 0.01."""
 CLEARLY: Final = 1.5
-"""Least ratio of what is explained to what turned surroundings explain."""
+"""Least ratio of the explained share to that of rotated environments."""
 LEAST: Final = 0.3
-"""Least g: there is no coat that reflects less than 0.012."""
+"""Least g: no coat reflects less than 0.012."""
 CONTRADICTED: Final = -0.12
-"""h, below which clipped light takes away what is mirrored beside it: g is then not known."""
+"""Value of h below which clipped light cancels adjacent reflections, so that g is undetermined."""
 FACTOR: Final = 2.0
-"""Factor by which the reflectance may be off either way."""
+"""Factor of uncertainty of the reflectance, in both directions."""
 WIDTHS: Final = 0.8
-"""Share of the best gain from which on a roughness may be the true one."""
+"""Share of the best explained share from which a roughness is possible."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,29 +78,29 @@ class Polish:
     """Roughness and reflectance of a table."""
 
     roughness: tuple[float, float, float]
-    """Likely, least and most."""
+    """Most likely, least and largest roughness."""
     reflectance: tuple[float, float, float] | None
-    """Likely, least and most; None: it mirrors, but only light that clips in the ball."""
+    """Most likely, least and largest reflectance; None: only reflections of clipped light were found."""
     gain: float
-    """Share of the differences between views that are explained."""
+    """Share of the differences between views that is explained."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Seen:
-    """n points in k views."""
+    """Observations of n points in k views."""
 
     points: Array
-    """(n, 3)."""
+    """Positions, (n, 3)."""
     radiance: Array
-    """(k, n, 3)."""
+    """Linear radiance, (k, n, 3)."""
     wo: Array
-    """Toward the camera, in the table's own axes, (k, n, 3)."""
+    """Direction toward the camera, in the table's own axes, (k, n, 3)."""
     tells: NDArray[np.bool_]
-    """(k, n)."""
+    """True where a point is usable in a view, (k, n)."""
 
     @property
     def mean(self) -> Array:
-        """Over the views, (n, 3)."""
+        """Mean radiance over the views, (n, 3)."""
         total = (self.radiance * self.tells[..., None]).sum(0)
         return np.asarray(np.maximum(total / np.maximum(self.tells.sum(0), 1)[:, None], 2e-3))
 
@@ -110,9 +110,9 @@ class _Fit:
     """Fit of one environment and roughness."""
 
     strength: Array
-    """g and, where light clips, h."""
+    """Strength g and, if light clips, h."""
     off: Array
-    """Differences that are left, over each point's mean, (k, n, 3)."""
+    """Residual differences, over each point's mean, (k, n, 3)."""
 
 
 def estimate_polish(
@@ -122,17 +122,17 @@ def estimate_polish(
     environment: NDArray[np.float32],
     table: NDArray[np.float32],
 ) -> Polish | None:
-    """Estimate how the first plane of a scene mirrors what the ball shows.
+    """Estimate the reflection of the environment in the first plane of a scene.
 
     Args:
-        scene: With a plane, a mirror ball and a card.
-        camera: Of the pictures' size.
-        views: RGB pictures (h, w, 3) and ``camera_from_world``, six or more that differ by twenty degrees and more.
-        environment: Radiance as the ball shows it, nothing recovered, camera values, (rows, 2 rows, 3).
+        scene: Scene with a plane, a mirror ball and a card.
+        camera: Camera of the pictures, at their size.
+        views: RGB pictures (h, w, 3) with ``camera_from_world``: six or more, at least twenty degrees apart.
+        environment: Environment as captured by the ball, without recovered light, camera values, (rows, 2 rows, 3).
         table: Linear value of each code, (256, 3).
 
     Returns:
-        None where the table is matt, or cannot be told from a matt one.
+        Result; None if the table is matt, or indistinguishable from a matt one.
     """
     plane = next((proxy for proxy in scene.proxies if proxy.shape == "plane" and proxy.material is None), None)
     if plane is None or not scene.probes or len(views) < VIEWS:
@@ -168,7 +168,7 @@ def estimate_polish(
 def _observe(
     scene: Scene, camera: Camera, plane: Proxy, views: Sequence[tuple[Image, Pose]], table: NDArray[np.float32]
 ) -> _Seen:
-    """Points of a plane beside card and balls, and what they show."""
+    """Return the points of a plane outside the card and the balls, with their radiance in all views."""
     side = np.linspace(-REACH, REACH, ACROSS)
     local = np.stack([*np.meshgrid(side, side), np.zeros((ACROSS, ACROSS))], -1).reshape(-1, 3)
     turn = rotation_matrix(plane.rotate)
@@ -205,33 +205,33 @@ def _observe(
 
 
 def _meets(probe: Probe, points: Array, directions: Array) -> NDArray[np.bool_]:
-    """Return which rays come near a ball."""
+    """Return True for rays that pass near a ball."""
     to = np.asarray(probe.center) - points
     along = (to * directions).sum(1)
     return np.asarray((along > 0.0) & ((to**2).sum(1) - along**2 < (1.6 * probe.radius) ** 2))
 
 
 def _sample(image: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> Array:
-    """Bilinear, (k, channels)."""
+    """Return bilinearly interpolated values, (k, channels)."""
     found = cv2.remap(image, x[:, None], y[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found.reshape(len(x), -1), float)
 
 
 def _look_up(maps: NDArray[np.float32], directions: Array) -> Array:
-    """Values of latlong maps in directions (k, 3), (k, channels)."""
+    """Return the values of latlong maps in directions (k, 3), (k, channels)."""
     rows, columns = maps.shape[:2]
     y = np.clip(np.arccos(np.clip(directions[:, 2], -1.0, 1.0)) / np.pi * rows - 0.5, 0.0, rows - 1.0)
     x = (np.arctan2(directions[:, 1], directions[:, 0]) / np.pi + 1.0) / 2.0 * columns + 0.5
     wrapped = np.concatenate([maps[:, -1:], maps, maps[:, :1]], axis=1)
     parts = [
         _sample(wrapped, *np.split(np.stack([x, y]).astype(np.float32)[:, low : low + 30_000].reshape(-1), 2))
-        for low in range(0, len(x), 30_000)  # ``cv2.remap`` takes no more rows
+        for low in range(0, len(x), 30_000)  # the limit of ``cv2.remap``
     ]
     return np.concatenate(parts)
 
 
 def _mirror(wo: Array, roughness: float, seed: int) -> tuple[Array, Array]:
-    """Rays that GGX's visible facets [DB23] reflect, (n, RAYS, 3), and their weight with Fresnel's, (n, RAYS)."""
+    """Return rays reflected by GGX's visible facets [DB23], (n, RAYS, 3), and weights with Fresnel's, (n, RAYS)."""
     alpha, shift = roughness**2, np.random.default_rng(seed).random((len(wo), 1, 2))
     steps = np.arange(RAYS)[None]
     turn, height = 2.0 * np.pi * ((steps / RAYS + shift[..., 0]) % 1.0), (steps * 0.6180339887 + shift[..., 1]) % 1.0
@@ -251,12 +251,12 @@ def _mirror(wo: Array, roughness: float, seed: int) -> tuple[Array, Array]:
 
 
 def _masking(cosine: Array, alpha: float) -> Array:
-    """Smith's Lambda."""
+    """Return Smith's Lambda."""
     return np.asarray(0.5 * (np.sqrt(1.0 + alpha**2 * (1.0 / np.maximum(cosine, 1e-4) ** 2 - 1.0)) - 1.0))
 
 
 def _explain(seen: _Seen, environment: NDArray[np.float32], turn: Array, roughness: float, hot: float) -> _Fit:
-    """Fit the mirror image of an environment to the differences between views."""
+    """Fit the reflection of an environment to the differences between views."""
     clips = cv2.dilate((environment.max(-1) >= hot).astype(np.float32), np.ones((3, 3)))
     known = np.where(clips[..., None] > 0.0, np.minimum(environment, hot), environment).astype(np.float32)
     rest = np.stack([clips, np.ones_like(clips)], axis=-1)
@@ -273,7 +273,7 @@ def _explain(seen: _Seen, environment: NDArray[np.float32], turn: Array, roughne
 
 
 def _solve(seen: _Seen, terms: list[Array]) -> _Fit:
-    """Least squares of the differences between views over terms and each view's exposure, robust by reweighting."""
+    """Fit terms and each view's exposure to the differences between views, by robust least squares."""
     mean, trust = seen.mean, np.ones_like(seen.radiance)
     drifts = []
     for view in range(1, len(seen.radiance)):
@@ -302,5 +302,5 @@ def _scatter(seen: _Seen, off: Array) -> float:
 
 
 def _cost(seen: _Seen, off: Array, scatter: float) -> float:
-    """Mean of squares, none counting more than three times the scatter."""
+    """Return the mean of squared residuals, each limited to three times the scatter."""
     return float(np.minimum((off[seen.tells] / (3.0 * scatter)) ** 2, 1.0).mean())

@@ -1,31 +1,31 @@
-"""Priors on light that clips, from the captured map alone: its regions, and how far they exceed clipping.
+"""Priors on clipped light from the captured map alone: its regions, and how far they exceed clipping.
 
-**By colour.** What is far brighter than clipping clips in all channels alike. What clips in one channel and not in
-another is hardly brighter than clipping: its hue would be odd otherwise. So the radiance that a component is expected
-to lack is in proportion to the square of the share of its clipped solid angle in which all channels clip (``alike``).
+**By colour.** Light far brighter than clipping clips in all channels. Light that clips in one channel only is hardly
+brighter than clipping, because its hue would be implausible otherwise. So the expected missing radiance of a component
+is proportional to the square of the share of its clipped solid angle in which all channels clip (``alike``).
 
-**By depth.** A sky that brightens toward the sun clips where it reaches the limit: what it lacks is nothing at that
-boundary and grows inward. A window or a lamp ends at a wall: what it lacks is the same up to its boundary. Cells that
-do not clip, beside those that do, tell which it is: they are nearly at clipping, or far below it. So within a component
-light is shared in proportion to the angle from the nearest boundary at which it fades (``depth_profile``), up to
-``PriorConfig.depth``: without such a boundary it is shared evenly.
+**By depth.** A sky that brightens toward the sun clips where it reaches the limit: its missing radiance is zero at that
+boundary and grows inward. A window or a lamp ends at a wall: its missing radiance is constant up to the boundary.
+Unclipped cells next to clipped ones distinguish the two: they are just below clipping, or far below it. So within a
+component missing light is distributed in proportion to the angle from the nearest fading boundary (``depth_profile``),
+up to ``PriorConfig.depth``; without such a boundary it is distributed evenly.
 
-**At least** (``least_missing``). Where no surface tells, what clips is raised by what nearly every place lacks. Let X
-be the irradiance that an estimate adds and D that which is missing. It is no worse than nothing as long as X is at most
-2 D. So twice a radiance that is missing nearly everywhere may be added without knowing more about the place. What
-nearly always is missing depends on what the map shows:
+**At least** (``least_missing``). If no surface measures clipped light, it is raised by the amount that is missing in
+nearly every scene. Let X be the irradiance that an estimate adds and D the missing irradiance. The result is no worse
+than the captured map as long as X is at most 2 D. So twice the radiance that is missing nearly everywhere may be added
+without further knowledge. This radiance depends on the map:
 
-- **How much clips.** The more of all directions clips, W steradians, the longer the exposure and the further what clips
-  lies above clipping: as W^(1/4), up to a steradian. A sky that clips in whole may be hardly above it.
-- **Whether channels clip alike** (``alike``). What clips in one channel alone is hardly brighter than clipping.
-- **Whether it fades.** Beside a lamp or a window it is far darker. Where cells beside what clips are nearly at it,
-  so may be what clips (``PriorConfig.fades``).
+- **Clipped solid angle.** The larger the clipped solid angle W in steradians, the longer the exposure, and the more
+  clipped light exceeds clipping: as W^(1/4), up to a steradian. A wholly clipped sky may be hardly above clipping.
+- **Clipped channels** (``alike``). Light that clips in one channel only is hardly brighter than clipping.
+- **Boundary.** Surroundings of a lamp or a window are far darker. If cells next to clipped ones are nearly clipped, the
+  clipped ones may be hardly brighter (``PriorConfig.fades``).
 
-A component of what clips is raised, in units of the level of clipping, by
+The radiance added to a clipped component, in units of the clipping level, is
 
     x = least * alike * sharp * W^(1/4).
 
-``bench clipping_prior`` has in how many exposures of a folder of environments that became worse.
+``bench clipping_prior`` counts the exposures of a folder of environments that become worse by it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 
 
 def connected_regions(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Connected part that each cell of a latlong mask belongs to, across the seam and the poles; -1 for none."""
+    """Return the connected component of each cell of a latlong mask, across the seam and the poles; -1 for none."""
     height = len(mask)
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     parent = list(range(count))
@@ -70,13 +70,13 @@ def connected_regions(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
 def split_regions(
     labels: NDArray[np.int64], directions: Array, solid_angles: Array, size: float = CONFIG.priors.region
 ) -> tuple[NDArray[np.int64], int]:
-    """Split regions that are wider than ``size`` steradians into compact parts of about that size.
+    """Split regions wider than ``size`` steradians into compact parts of about that size.
 
     Args:
         labels: Region of each cell, -1 for none, (m,).
-        directions: Unit, (m, 3).
-        solid_angles: (m,).
-        size: Steradians.
+        directions: Unit directions of cells, (m, 3).
+        solid_angles: Solid angles of cells, steradians, (m,).
+        size: Largest solid angle, steradians.
 
     Returns:
         Part of each cell, -1 for none, and the number of parts.
@@ -104,19 +104,19 @@ def split_regions(
 
 
 WHOLE = 0.9
-"""Share from which a cell clips in whole and shows the level of clipping."""
+"""Clipped share from which a cell counts as wholly clipped and shows the clipping level."""
 
 
 def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], count: int) -> Array:
     """Return the expected missing light of each component relative to one with all channels clipped, (count,).
 
-    The share of its clipped solid angle in which all channels clip, squared, and at least ``least_alike``.
+    It is the squared share of its clipped solid angle in which all channels clip, and at least ``least_alike``.
 
     Args:
-        clipped: Share of cells at clipping, per channel, (m, 3).
-        solid_angle: Steradians, (m,).
-        component: Of each cell, -1 for none, (m,).
-        count: Of components.
+        clipped: Clipped share of cells, per channel, (m, 3).
+        solid_angle: Solid angles of cells, steradians, (m,).
+        component: Component of each cell, -1 for none, (m,).
+        count: Number of components.
     """
     inside = component >= 0
     every, some = (
@@ -127,11 +127,11 @@ def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], coun
 
 
 def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
-    """Return what cells lack over the mean of their component, by their depth inside it, per channel, (m, 3).
+    """Return the missing radiance of cells relative to their component's mean, by depth inside it, per channel, (m, 3).
 
     Args:
         cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
-        component: Of each cell, -1 for none, (m,).
+        component: Component of each cell, -1 for none, (m,).
     """
     flat, profile = cells.ravel(), np.ones((cells.size, 3))
     beyond, seen = flat["modelled"] <= 0.5, flat["hidden"] <= 0.5
@@ -160,7 +160,7 @@ def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
 
 
 def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A latlong mask and its neighbours, across the seam."""
+    """Return a latlong mask with its neighbours added, across the seam."""
     wide = np.pad(mask, ((0, 0), (1, 1)), mode="wrap").astype(np.uint8)
     return np.asarray(cv2.dilate(wide, np.ones((3, 3), np.uint8))[:, 1:-1] > 0)
 
@@ -168,14 +168,14 @@ def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def least_missing(
     radiance: NDArray[Any], clipped: NDArray[Any], solid_angle: NDArray[Any], is_light: NDArray[np.bool_]
 ) -> Array:
-    """Return the prior's addition to the radiance of a wholly clipped texel, (rows, columns, 3).
+    """Return the radiance that the prior adds to a wholly clipped texel, (rows, columns, 3).
 
     Args:
-        radiance: Mean of cells of a latlong map, as captured, (rows, columns, 3).
-        clipped: Share of them at clipping, per channel, (rows, columns, 3).
-        solid_angle: Steradians, (rows, columns).
-        is_light: Cells that were seen and show no modelled surface, (rows, columns): what clips elsewhere is lit or
-            unknown.
+        radiance: Mean radiance of cells of the captured latlong map, (rows, columns, 3).
+        clipped: Clipped share of cells, per channel, (rows, columns, 3).
+        solid_angle: Solid angles of cells, steradians, (rows, columns).
+        is_light: Cells that were seen and show no modelled surface, (rows, columns): clipped light elsewhere is
+            reflected, or unknown.
     """
     own = np.where(is_light[..., None], clipped, 0.0)
     some = own.max(axis=-1)
@@ -185,7 +185,7 @@ def least_missing(
     found = np.zeros(np.shape(radiance), np.float64)
     if count == 0:
         return found
-    # No cell is brighter than clipping, and the brightest ones clip throughout where something wide enough does.
+    # No cell exceeds clipping, and the brightest cells of a wide clipped area are wholly clipped: they show the level.
     level = np.asarray(radiance, np.float64)[inside].max(axis=0)
     area = np.asarray(solid_angle, np.float64)
     wide = min(float((area * some)[inside].sum()), CONFIG.least.most)
@@ -196,13 +196,13 @@ def least_missing(
 
 
 def _sharp(radiance: Array, area: Array, component: NDArray[np.int64], is_light: NDArray[np.bool_]) -> Array:
-    """Return how far components end at something darker, 0 to 1, (components,); half where nothing beside one was seen.
+    """Return the sharpness of components' boundaries, 0 to 1, (components,); 0.5 if no adjacent cell was seen.
 
     Args:
-        radiance: Of cells over the level of clipping, (rows, columns, 3).
-        area: Steradians, (rows, columns).
-        component: Of each cell, -1 for none, (rows, columns).
-        is_light: Cells that tell, (rows, columns).
+        radiance: Radiance of cells over the clipping level, (rows, columns, 3).
+        area: Solid angles of cells, steradians, (rows, columns).
+        component: Component of each cell, -1 for none, (rows, columns).
+        is_light: Cells to use, as in ``least_missing``, (rows, columns).
     """
     below, nearly = CONFIG.priors.fades
     brightness = np.clip(radiance, 0.0, 1.0).mean(axis=-1)

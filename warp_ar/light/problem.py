@@ -1,4 +1,4 @@
-"""The equations of one frame: which light each surface point receives from what is known and what is not."""
+"""Equations of one frame: known and unknown light that each surface point receives."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from warp_ar.light.surfaces import Surfaces, measured_noise, shared_errors
 Array = NDArray[np.float64]
 
 Trace = Callable[[NDArray[np.float32]], Array]
-"""Irradiance at every surface point per unit intensity of emitters (q, 4: position, radius), (n, q)."""
+"""Function from emitters (q, 4: position, radius) of unit intensity to their irradiance at all points, (n, q)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A candidate for an emitter."""
+    """Candidate for an emitter."""
 
     cell: int
-    """In whose direction it stands."""
+    """Index of the cell in whose direction it is."""
     distance: float
-    """Metres from where the ball mirrors it; infinite: distant."""
+    """Distance in metres from the point where the ball reflects it; infinite: distant."""
 
 
 def mirroring_points(directions: Array, center: Array, radius: float, camera: Array | None) -> Array:
-    """Return the points of a ball in which a camera far away sees each direction mirrored, (m, 3).
+    """Return the points of a ball that reflect each direction to a distant camera, (m, 3).
 
     Args:
-        directions: Unit, (m, 3).
-        center: Of the ball, metres, (3,).
-        radius: Of the ball, metres.
-        camera: Where it stands, metres, (3,); None: the centre for all.
+        directions: Unit directions, (m, 3).
+        center: Centre of the ball, metres, (3,).
+        radius: Radius of the ball, metres.
+        camera: Position of the camera, metres, (3,); None: return the centre for all.
     """
     if camera is None:
         return np.broadcast_to(center, directions.shape)
@@ -47,11 +47,12 @@ def mirroring_points(directions: Array, center: Array, radius: float, camera: Ar
 
 
 def emitter_directions(cells: NDArray[Any]) -> Array:
-    """Return the direction in which an emitter of each cell stands, unit, (m, 3).
+    """Return the unit direction of a possible emitter in each cell, (m, 3).
 
-    A lamp's picture in the ball is wider than a cell, and the equations hardly tell which cell holds its middle. So it
-    is the middle of the spot that clips around the cell, found by mean shift, where nothing else clips within twice
-    ``search.angle``. Within a window or a sky, whose middle is not its brightest part, it is the cell's own direction.
+    A lamp's image in the ball is wider than a cell, and the equations hardly determine which cell contains its centre.
+    If nothing else clips within twice ``search.angle``, the direction is the centre of the clipped spot around the
+    cell, found by mean shift. Within a window or a sky, whose centre is not its brightest part, it is the cell's own
+    direction.
     """
     search = CONFIG.search
     direction = cells["direction"].reshape(-1, 3).astype(float)
@@ -70,7 +71,7 @@ def emitter_directions(cells: NDArray[Any]) -> Array:
 
 
 class Problem:
-    """The equations of one frame."""
+    """Equations of one frame."""
 
     def __init__(
         self,
@@ -84,18 +85,18 @@ class Problem:
         aim: Array,
         origin: Array,
     ) -> None:
-        """Set up both sides.
+        """Set up both sides of the equations.
 
         Args:
             cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
-            transfer: From ``trace_transfer``, straight, (n, rows * columns).
-            mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
+            transfer: Direct transfer from ``trace_transfer``, (n, rows * columns).
+            mirrored: Transfer by reflection in balls from ``trace_transfer``, (n, rows * columns).
             observations: Records of ``Observation``, (n,).
-            surfaces: The points.
+            surfaces: Surface points.
             white: Reflectance of the card's paper.
-            trace: Traces emitters at finite distances; None: all light is distant.
-            aim: From ``emitter_directions``, (rows * columns, 3).
-            origin: From ``mirroring_points`` for these, (rows * columns, 3).
+            trace: Function that traces emitters at finite distances; None: all light is distant.
+            aim: Directions from ``emitter_directions``, (rows * columns, 3).
+            origin: Points from ``mirroring_points`` for these directions, (rows * columns, 3).
         """
         self.shape = cells.shape
         self.trace, self.aim, self.origin = trace, aim, origin
@@ -110,10 +111,10 @@ class Problem:
         faces = self.kinds == Kind.FACE
         one_box = faces & faces[:, None] & (self.groups == self.groups[:, None])
         self.ties = np.argwhere(np.tril(one_box, -1))
-        """Pairs of faces of one box, whose reflectances are alike, (pairs, 2)."""
+        """Pairs of faces of one box, whose reflectances are similar, (pairs, 2)."""
 
     def _read_cells(self, cells: NDArray[Any]) -> Array:
-        """The map's side; returns the share of each cell that clips in any channel, (m,)."""
+        """Store the cells of the map; return the share of each cell that clips in any channel, (m,)."""
         self.radiance = cells["radiance"].reshape(-1, 3).astype(float)
         self.lost = cells["clipped"].reshape(-1, 3).astype(float)
         self.missing = cells["missing"].reshape(-1, 3).astype(float)
@@ -121,14 +122,14 @@ class Problem:
         self.solid_angle = cells["solid_angle"].ravel().astype(float)
         self.modelled = cells["modelled"].ravel() > 0.5
         self.hidden = cells["hidden"].ravel().astype(float)
-        # None where nothing is seen: shading may say that light is missing, hardly where it comes from.
+        # No candidates in unseen cells: shading measures missing light, but hardly its direction.
         seen = self.hidden <= 0.0
         self.may_hold_candidate = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
         return np.asarray(self.lost.max(axis=1) - self.hidden, np.float64)
 
     def _group_cells(self, cells: NDArray[Any], clipped: Array) -> None:
-        """Regions, their components, and the radiance that those are expected to have."""
-        # What clips on modelled surfaces is not joined to what clips beyond.
+        """Group clipped cells into parts and components, and compute the expected missing radiance of components."""
+        # Clipped modelled surfaces are kept separate from clipped cells of the environment.
         beyond = connected_regions(((clipped > LOST) & ~self.modelled).reshape(self.shape)).ravel()
         lit = connected_regions(((clipped > LOST) & self.modelled).reshape(self.shape)).ravel()
         component = np.where(lit >= 0, lit + beyond.max(initial=-1) + 1, beyond)
@@ -150,7 +151,7 @@ class Problem:
         self.member[np.flatnonzero(inside), self.part[inside]] = 1.0
 
     def _read_points(self, observations: NDArray[Any], surfaces: Surfaces, white: float) -> None:
-        """The frame's side: what points show, and how far that can be relied on."""
+        """Store the visible points, with their radiance and its reliability."""
         seen = observations["visible"] > 0.8
         self.index = np.flatnonzero(seen)
         shown = observations[seen]
@@ -161,7 +162,7 @@ class Problem:
         self.kind = self.kinds[self.surface]
         self.shared = shared_errors(surfaces.overlap, surfaces.kinds[surfaces.surface], seen)
         self.light = np.pi * shown["radiance"].astype(float)
-        # Patches on a clutter's edge, or half in a sharp shadow, say nothing.
+        # Patches at the edge of clutter, or half in a sharp shadow, are not used.
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
         self.exact = (self.light > CONFIG.surfaces.dark) & even & (shown["clipped"] < 0.01)
         self.bound = shown["clipped"] > 0.5
@@ -169,20 +170,20 @@ class Problem:
         self.noise, scatter = measured_noise(points, self.surface, self.kinds, self.light, self.exact)
         told = self.surface[self.exact.all(axis=1) & (self.kind >= Kind.PLANE)]
         self.texture = float(np.median(scatter[told] / self.noise[told])) if len(told) else 1.0
-        """Ratio of the scatter of surfaces beside the card to ``noise``: at least 1."""
+        """Ratio of the scatter of surfaces other than the card to ``noise``; at least 1."""
 
     def leave_out(self, points: NDArray[np.bool_]) -> None:
-        """Take points out of the equations, (n,): they show something else than their surface, and are of no kind."""
+        """Exclude points from the equations, (n,), because they show something other than their surface."""
         self.exact[points] = self.bound[points] = False
         self.kind = np.where(points, -1, self.kind)
 
     def _aim_transfer(
         self, cells: NDArray[Any], transfer: NDArray[Any], mirrored: NDArray[Any], surfaces: Surfaces, clipped: Array
     ) -> NDArray[Any]:
-        """Transfer from where cells clip; returns that part of it which comes by way of balls."""
+        """Store the transfer from the centres of clipped light; return the part by reflection in balls."""
         through_balls = mirrored[self.index]
         self.transfer = transfer[self.index]
-        # What clips in a cell lies off its middle, for which transfer was traced.
+        # Clipped light lies off its cell's centre, for which transfer was traced.
         emitters = np.flatnonzero((clipped > LOST) & ~self.modelled)
         normals = surfaces.points["normal"][self.index]
         cosine = normals @ cells["middle"].reshape(-1, 3)[emitters].T
@@ -193,7 +194,7 @@ class Problem:
 
     def _sum_light(self, through_balls: NDArray[Any]) -> None:
         """Compute captured irradiance, its share by way of balls, and irradiance of each part per unit radiance."""
-        # With what clips taken to be some ten times as bright: only the order of magnitude matters.
+        # Clipped light is assumed ten times as bright: only the order of magnitude matters.
         bright = (self.radiance + 10.0 * self.missing * self.radiance).mean(axis=1)
         sums = self.transfer @ np.column_stack([self.radiance, bright]).astype(np.float32)
         self.captured = sums[:, :3]
@@ -202,9 +203,9 @@ class Problem:
         self._sum_parts()
 
     def share_by_depth(self) -> None:
-        """Let what cells lack grow inward from where it fades, within parts and around candidates.
+        """Distribute missing light by depth from fading boundaries, within parts and around candidates.
 
-        Candidates are looked for before: light that lies where an emitter stands would speak against there being one.
+        Candidates are searched for before this, because light that is already at an emitter's place would hide it.
         """
         self.profile = self._depth
         self.missing = self.missing * self.profile
@@ -215,7 +216,7 @@ class Problem:
             self.push(candidate)
 
     def _sum_parts(self) -> None:
-        """Irradiance of each part per radiance."""
+        """Compute the irradiance of each part per unit radiance."""
         order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
         starts = np.unique(self.part[order], return_index=True)[1]
         columns = [np.zeros((len(self.index), 0))] * 3
@@ -225,7 +226,7 @@ class Problem:
         self.columns = np.stack(columns)
 
     def card_means(self) -> tuple[Array, tuple[bool, bool, bool]]:
-        """Common mean per channel that makes the card right, and whether that is a lower bound only."""
+        """Return the common mean per channel that makes the card correct, and whether it is a lower bound only."""
         card = np.flatnonzero(self.kind == Kind.CARD)
         exact = self.exact[card]
         bounds = exact.sum(axis=0) < max(3.0, 0.3 * len(card))
@@ -244,14 +245,14 @@ class Problem:
         return means, (bool(bounds[0]), bool(bounds[1]), bool(bounds[2]))
 
     def card_factor(self, bounds: tuple[bool, bool, bool], doubt: float) -> float:
-        """Return the share, 0 to 1, of the correction by the card that is applied.
+        """Return the share, 0 to 1, of the card's correction that is applied.
 
-        The card's irradiance errs by its white, the response and the ball. What is missing of it is at least the
-        measured less that error, and up to twice the missing is no worse than nothing.
+        The card's irradiance has errors of its white, the response and the ball. The missing part is at least the
+        measured one minus that error, and adding up to twice the missing part is no worse than adding nothing.
 
         Args:
             bounds: From ``card_means``.
-            doubt: Standard deviation of the card's logarithm.
+            doubt: Standard deviation of the logarithm of the card's radiance.
         """
         config = CONFIG.evidence
         shares = [self.card_share(c, bounds[c]) for c in range(3)]
@@ -260,23 +261,22 @@ class Problem:
         return float(np.clip(2.0 * (missing - error) / max(missing, 1e-9), 0.0, 1.0))
 
     def card_share(self, c: int, is_bound: bool) -> float:
-        """Share of the card's irradiance that the light as captured leaves open in a channel; 0 where it is not seen.
+        """Return the share of the card's irradiance in a channel that captured light lacks; 0 without a card.
 
         Args:
             c: Channel.
-            is_bound: Whether the card clips: then it is more.
+            is_bound: Whether the card clips, so that the share is a lower bound.
         """
         use = (self.kind == Kind.CARD) & (self.exact[:, c] | (self.bound[:, c] & is_bound))
         if not use.any():
             return 0.0
         return max(1.0 - float(np.median(self.captured[use, c] * self.white / self.light[use, c])), 0.0)
 
-    # Unknowns stand in this order: parts, candidates, means of components, the common mean, 1 / reflectance of each
-    # surface.
+    # Order of unknowns: parts, candidates, means of components, the common mean, 1 / reflectance of each surface.
 
     @property
     def first_mean(self) -> int:
-        """Place of the first component's mean."""
+        """Index of the first component's mean."""
         return self.parts + len(self.candidates)
 
     @property
@@ -285,7 +285,7 @@ class Problem:
         return self.first_mean + self.components + 1
 
     def start(self, means: Array) -> Array:
-        """Unknowns of channels as the card alone has them, (3, unknowns); surfaces are left open (0)."""
+        """Return start values of the unknowns by the card alone, (3, unknowns); 0 for surfaces."""
         z = np.zeros((3, self.first_surface + len(self.kinds)))
         z[:, : self.parts] = means[:, None] * self.expected[self.component]
         z[:, self.first_mean : self.first_surface - 1] = means[:, None] * self.expected
@@ -293,7 +293,7 @@ class Problem:
         return z
 
     def power_columns(self, candidates: Sequence[Candidate]) -> Array:
-        """Irradiance per unit power of candidates, (points, q)."""
+        """Return irradiance per unit power of candidates, (points, q)."""
         cells = np.array([candidate.cell for candidate in candidates])
         distances = np.array([candidate.distance for candidate in candidates])
         columns: Array = np.asarray(self.transfer[:, cells] / self.solid_angle[cells], np.float64)
@@ -309,14 +309,14 @@ class Problem:
         return columns
 
     def patch(self, cell: int) -> Array:
-        """Radiance that a unit of a candidate's power is, spread over the cells around it that lack light, (m, 3)."""
+        """Return the radiance of a candidate's unit power, distributed over cells around it that clip, (m, 3)."""
         near = (self.direction @ self.direction[cell] > np.cos(CONFIG.search.angle)) & self.may_hold_candidate
         near[cell] = True
         total = self.solid_angle[near] @ self.missing[near]
         return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
 
     def light_of(self, candidates: Sequence[Candidate]) -> Array:
-        """Irradiance per unit power of candidates as channels show it, (3, points, q)."""
+        """Return irradiance per unit power of candidates, by channel, (3, points, q)."""
         light = np.repeat(self.power_columns(candidates)[None], 3, axis=0)
         for k, candidate in enumerate(candidates):
             patch = self.patch(candidate.cell)
@@ -338,7 +338,7 @@ class Problem:
         self.candidate_columns = self.candidate_columns[:, :, :-1]
 
     def distant_radiance(self, unknowns: Array) -> Array:
-        """Radiance that cells lack by parts and candidates at infinity, (m, 3).
+        """Return the missing radiance of cells from parts and candidates at infinity, (m, 3).
 
         Args:
             unknowns: Radiance of parts, then power of candidates, (parts + candidates, 3).
@@ -350,7 +350,7 @@ class Problem:
         return radiance
 
     def near_emitters(self, unknowns: Array) -> list[tuple[Array, Array]]:
-        """Places of candidates that are not at infinity, metres (3,), and their intensities, (3,)."""
+        """Return positions, metres (3,), and intensities, (3,), of the candidates at finite distances."""
         return [
             (self.origin[one.cell] + one.distance * self.aim[one.cell], power * one.distance**2)
             for one, power in zip(self.candidates, unknowns[self.parts :], strict=True)
@@ -358,6 +358,6 @@ class Problem:
         ]
 
     def added_irradiance(self, unknowns: Array) -> Array:
-        """Irradiance of points by parts and candidates, each candidate where it stands, (points, 3)."""
+        """Return irradiance of points from parts and candidates, with candidates at their distances, (points, 3)."""
         columns = np.concatenate([self.columns, self.candidate_columns], axis=2)
         return np.asarray(np.einsum("cnk,kc->nc", columns, unknowns), np.float64)

@@ -1,41 +1,40 @@
-"""Light that clipping lost in the ball, found again from surfaces that the same light falls on.
+"""Recovery of light that clips in the ball, from surfaces that receive the same light.
 
-**Unknowns.** Cells of the environment that clip (``kernels/recovery/recover_cells.py``) are grouped to regions:
-connected ones, split where they are wider than some steradians. Region r lacks the radiance s_r >= 0, per channel, on
-top of what the ball shows. Beside regions stand *candidates*: emitters or a sun within a region, or where no ball sees,
-each with its power p_j >= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface
-k has the unknown reflectance 1 / u_k; the card's is known.
+**Unknowns.** Clipped cells of the environment (``kernels/recovery/recover_cells.py``) are grouped into regions:
+connected components, split if they are wider than a given solid angle. Region r misses the radiance s_r >= 0, per
+channel, in addition to the ball's. Further unknowns are *candidates*: emitters or a sun within a region or in
+directions unseen by the ball, each with a power p_j >= 0 (radiance times solid angle, as seen from the ball), a
+direction and a distance. A surface k has the unknown reflectance 1 / u_k; the card's is known.
 
-**Equations.** A surface point x that shows the radiance L receives
+**Equations.** A surface point x with the radiance L receives
 
     pi L(x) u_k = e(x) + sum_r a_r(x) s_r + sum_j b_j(x) p_j,     e = T radiance,  a_r = T clipped over the cells of r,
 
-linear in the unknowns, none of which is negative. Divided by pi L and by u's last estimate a residual is a relative
-error: the surface's texture, transport that the model leaves out; how large it is, points of a surface say by how far
-they scatter (``measured_noise``). Points that clip bind from one side only: they count
-while the prediction is under what they show. Where the card clips in whole, the sum of the energy has a lower bound
-only, and the estimate says so; ink, a twentieth as bright, and surfaces in shadow then carry it as far as priors on
-their reflectances allow.
+linear in the non-negative unknowns. Divided by pi L and by the last estimate of u, a residual is a relative error: the
+surface's texture and the error of the transport model. Its size is measured by the scatter of a surface's points
+(``measured_noise``). Clipped points are one-sided: they count only while the prediction is below the clipping level. If
+the whole card clips, the total energy has only a lower bound, which the estimate states. Ink, a twentieth as bright,
+and shadowed surfaces then determine it, as far as the priors on their reflectances allow.
 
-**Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that
-about one mean of all: less where channels clip apart from each other, and growing inward where it fades
-(``light/priors.py``). The common mean is free; where nothing but the
-card is used it is what makes the card right, and that alone is the method ``white_card``. Clipped pixels that show a
-modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
-distribution: a second pass draws each to the mean of all three, in the hue of their totals.
+**Priors** determine directions that surfaces do not measure. The s_r of a region deviates from the mean of its
+connected component, and that mean from a common mean: less if its channels clip separately, and growing inward if its
+boundary fades (``light/priors.py``). The common mean is free. If only the card is used, this mean makes the card's
+radiance correct, which is the method ``white_card``. Clipped pixels of a modelled surface (the card in the ball, a box)
+are reflected light and stay close to clipping. Channels share their distribution: a second pass draws each channel to
+the mean of all three, in the hue of their totals.
 
-**Emitter candidates** are chosen one by one, among all directions that may lack light and a grid of distances, by how
-far they lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest,
-then moved to neighbouring cells and distances while that helps, and kept if the costs of two channels fall by more than
-``evidence``. An emitter at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light
-tell D. D counts from where the ball mirrors the emitter to the camera, which may lie a ball's radius beside its middle.
-An emitter that is known moves only for a larger gain: emitters stand still.
+**Emitter candidates** are chosen one by one, among all directions that may miss light and a grid of distances, by their
+decrease of the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b). The best few are fitted fully, then
+moved to neighbouring cells and distances while the cost decreases, and kept if the costs of two channels decrease by
+more than ``evidence``. An emitter at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falloff of its
+light determine D. D is measured from the point where the ball reflects the emitter to the camera, up to a radius from
+the ball's centre. A known emitter is moved only for a larger decrease, because emitters do not move.
 
-Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
-without it, the more parts and equations there are, the more all of them would shrink together.
+Each deviation is relative to an unknown, a mean or a reflectance. The derivative keeps the dependence on that scale:
+without it, all scales would shrink together, the more so the more parts and equations there are.
 
-**Solution.** Iteratively reweighted least squares with Cauchy weights; each quadratic problem with non-negative
-unknowns is solved by an active set that starts from the last solution. Some 400 equations and 60 unknowns. Equal input
+**Solution.** Iteratively reweighted least squares with Cauchy weights. Each quadratic problem has non-negative unknowns
+and is solved by an active-set method from the last solution. There are about 400 equations and 60 unknowns. Equal input
 gives equal output.
 """
 
@@ -64,22 +63,22 @@ METHODS: Final = ("clipped", "white_card", "shading")
 
 
 class Recovery:
-    """Estimates what clipping took, frame by frame; keeps the emitters that it found."""
+    """Estimates clipped light frame by frame, and keeps the emitters that it finds."""
 
     def __init__(
         self, surfaces: Surfaces, white: float, center: Sequence[float], *, radius: float = 0.0, method: str = "shading"
     ) -> None:
-        """Prepare.
+        """Prepare the solver for a scene's surfaces.
 
         Args:
-            surfaces: From ``find_surfaces``.
+            surfaces: Surface points from ``find_surfaces``.
             white: Reflectance of the card's paper.
             center: Centre of the ball, metres.
-            radius: Of the ball, metres: emitters are seen from its surface. 0: from its centre.
+            radius: Radius of the ball, metres: emitters are seen from its surface. 0: from its centre.
             method: ``white_card`` or ``shading``.
 
         Raises:
-            ValueError: There is no such method.
+            ValueError: The method is unknown.
         """
         if method not in METHODS[1:]:
             raise ValueError(f"recover: no method {method!r} to estimate; expected {' or '.join(METHODS[1:])}")
@@ -94,9 +93,9 @@ class Recovery:
         self._steadiness = Steadiness()
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
-        """Return whether the last estimate still holds, as far as the light tells: then there is nothing to solve for.
+        """Return True if the last estimate still holds, by the change of the light, so that nothing is solved.
 
-        Takes note of what it is given, unless it holds.
+        If not, the given light is remembered as that of the next estimate.
 
         Args:
             cells: As for ``update``.
@@ -117,11 +116,11 @@ class Recovery:
 
         Args:
             cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
-            transfer: From ``trace_transfer``, straight, (n, rows * columns).
-            mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
+            transfer: Direct transfer from ``trace_transfer``, (n, rows * columns).
+            mirrored: Transfer by reflection in balls from ``trace_transfer``, (n, rows * columns).
             observations: Records of ``Observation``, (n,).
-            trace: Traces emitters at finite distances; None: all light is distant.
-            camera: Where the camera stands, metres, (3,); None: emitters are as seen from the ball's centre.
+            trace: Function that traces emitters at finite distances; None: all light is distant.
+            camera: Position of the camera, metres, (3,); None: emitters are seen from the ball's centre.
         """
         with one_blas_thread():
             aim = emitter_directions(cells)
@@ -136,7 +135,7 @@ class Recovery:
         return estimate
 
     def _solve(self, problem: Problem) -> Estimate:
-        """``update``, by the thread that asks for it alone."""
+        """Solve the equations; called by ``update`` on the thread that holds the solver's lock."""
         self._frames += 1
         card = check_card(problem.points, problem.kind, problem.light)
         if not card.holds:
@@ -158,7 +157,7 @@ class Recovery:
         means = np.maximum(means, 0.05)
         solution = _solve_channels(problem, best, means, bounds)
         recovered, powers = problem.member @ solution[: problem.parts], solution[problem.parts :]
-        # An emitter that gives nothing in any channel has gone out, or never was.
+        # An emitter without power in any channel has been switched off, or was never there.
         self._candidates = [
             candidate for candidate, power in zip(problem.candidates, powers, strict=True) if power.any()
         ]
@@ -183,9 +182,9 @@ class Recovery:
         return self._held
 
     def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
-        """Return the last estimate while the card is hidden for a while, else what nearly every place lacks at least.
+        """Return the last estimate while the card is hidden for a short time, else the least missing light.
 
-        Without a surface of known reflectance only the shape of shadows tells how bright an emitter is, and texture,
+        Without a surface of known reflectance, only the shape of shadows measures an emitter's brightness, and texture,
         gloss and clutter look like shadows.
         """
         self._unseen += 1
@@ -200,7 +199,7 @@ class Recovery:
         return self._estimate(problem, least, (True, True, True), "least", float(least.any()), card)
 
     def _search(self, problem: Problem, means: Array) -> None:
-        """Try candidates of former frames, one of them moved, and new ones where it is their turn to be looked for."""
+        """Try the candidates of former frames, move one of them, and search for new ones if a search is due."""
         config = CONFIG.search
         for candidate in self._candidates:
             if problem.may_hold_candidate[candidate.cell]:
@@ -226,7 +225,7 @@ class Recovery:
         card: CardCheck,
         emitters: tuple[FoundEmitter, ...] = (),
     ) -> Estimate:
-        """The share ``factor`` of a solution, and between which bounds that leaves irradiance."""
+        """Return the share ``factor`` of a solution as an estimate, with the interval of the irradiance."""
         if factor == 0.0:
             method, emitters = "clipped", ()
         emitters = tuple(dataclasses.replace(emitter, power=factor * emitter.power) for emitter in emitters)
@@ -238,22 +237,22 @@ class Recovery:
 
 
 def _by_card(problem: Problem) -> tuple[Array, tuple[bool, bool, bool], Array]:
-    """Return ``card_means``, and the radiance that parts lack for the card to be right, (parts, 3)."""
+    """Return the results of ``card_means``, and the missing radiance of parts by the card alone, (parts, 3)."""
     means, bounds = problem.card_means()
     return means, bounds, problem.expected[problem.component][:, None] * means
 
 
 def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[bool, bool, bool]) -> Array:
-    """Radiance of parts and power of candidates in all channels, (parts + candidates, 3).
+    """Return radiance of parts and power of candidates in all channels, (parts + candidates, 3).
 
     Args:
-        problem: The equations, its candidates chosen.
-        best: The channel that surfaces show best.
-        means: What the card alone has it, per channel.
-        bounds: Channels in which the card does not tell.
+        problem: The equations, with their candidates chosen.
+        best: Channel that surfaces measure best.
+        means: Common means by the card alone, per channel.
+        bounds: Channels in which the card gives a lower bound only.
     """
     bright, start = problem.first_mean, problem.start(means)
-    # Where the card does not tell, reflectances in a channel in which it does are worth more than guesses.
+    # In channels without the card, reflectances from a channel with the card are better than their priors.
     told = min(range(3), key=lambda c: (bounds[c], c != best))
     known, follows = None, np.array(bounds) & (np.arange(3) != told)
     first = fit_channels(problem, start, CONFIG.solver.iterations).z
@@ -270,7 +269,7 @@ def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[boo
 
 
 def choose_channel(problem: Problem) -> int:
-    """The channel that surfaces show best; green of equals.
+    """Return the channel that surfaces measure best; green if several are equal.
 
     Args:
         problem: The equations.

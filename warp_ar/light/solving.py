@@ -1,11 +1,11 @@
-"""Estimates in a process beside this one, on CUDA and for pictures that are shown as they are made.
+"""Estimates in a separate process, on CUDA and for pictures that are shown in real time.
 
-A solution is tens of milliseconds of NumPy products that hold Python's lock; a thread of this process that launches
-kernels or looks for markers would wait for it at each of its calls. A process costs the frames the copies of its
-equations, some 12 MB. It keeps nothing between two estimates: a solver goes there and comes back with what it learnt,
-so a process that dies costs one estimate, which is then made here.
+A solution takes tens of milliseconds of NumPy products that hold Python's lock. A thread of this process that launches
+kernels or finds markers would wait for the lock at each of its calls. A separate process costs the frames only copies
+of the equations, some 12 MB. It keeps no state between estimates: a solver is sent and returned with its updated state.
+If the process dies, one estimate is lost and computed here instead.
 
-The process is no child of ``multiprocessing``, which would run the main module of the caller again.
+The process is not started by ``multiprocessing``, which would run the caller's main module again.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ _BLAS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 class Solver(Protocol):
-    """A solver; it and its arguments can be pickled."""
+    """Solver that can be pickled together with its arguments."""
 
     def update(self, *sides: Any) -> Any:
         """Solve; the fifth argument traces emitters."""
 
 
 class SolvingProcess:
-    """One process that solves for all pipelines of this one, an estimate at a time."""
+    """Process that solves for all pipelines of this process, one estimate at a time."""
 
     def __init__(self) -> None:
-        """Start nothing yet."""
+        """Create the object without starting the process."""
         self._forget()
 
     def _forget(self) -> None:
-        """Have no process: also in a fork, whose parent the process goes on to solve for."""
+        """Drop the process without ending it; also in a fork, because the process belongs to the parent."""
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Any = None
@@ -52,23 +52,23 @@ class SolvingProcess:
             if self._process is not None or self._closed:
                 return
             ours, theirs = multiprocessing.Pipe()
-            # Where this process finds what it imports, wherever it stands now and however it was begun.
+            # Import paths of this process as absolute paths, independent of the working folder.
             paths = [str(Path(__file__).parents[2]), *(os.path.abspath(path) for path in sys.path)]
             code = f"import sys; sys.path[:] = {paths!r}; from {__name__} import serve; serve({theirs.fileno()})"
-            with contextlib.suppress(OSError), theirs:  # no more processes: solved for here
+            with contextlib.suppress(OSError), theirs:  # if no process can be started, estimates are computed here
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", code],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     env={**os.environ, **dict.fromkeys(_BLAS, "1")},
-                    start_new_session=True,  # an interrupt of the terminal is not for it
+                    start_new_session=True,  # without the terminal's interrupts
                     pass_fds=(theirs.fileno(),),
                 )
             self._connection = ours
 
     @property
     def ready(self) -> bool:
-        """True where the process can solve, or is at work."""
+        """True if the process is ready to solve, or is solving."""
         if not self._ready and self._process is not None and self._lock.acquire(blocking=False):
             try:
                 with contextlib.suppress(EOFError, OSError):
@@ -79,19 +79,19 @@ class SolvingProcess:
 
     @property
     def starting(self) -> bool:
-        """True where the process is not ready yet, but about to be."""
+        """True while the process is starting."""
         return not self.ready and self._process is not None and self._process.poll() is None
 
     def update(self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> tuple[Any, Any]:
-        """Solve, in the process if it is ready, else here.
+        """Solve in the process if it is ready, otherwise here.
 
         Args:
-            solver: It is not changed where the process solves.
-            sides: Cells, transfer, mirrored, observations and the camera's place, as ``Recovery.update``.
-            trace: Traces emitters, called by this thread.
+            solver: Solver; it is unchanged if the process solves.
+            sides: Cells, transfer, mirrored, observations and the camera's position, as for ``Recovery.update``.
+            trace: Function that traces emitters; called on this thread.
 
         Returns:
-            The solver with what it learnt, and its solution.
+            The solver with its updated state, and its solution.
         """
         solved = self._ask(solver, sides, trace) if self.ready else None
         return (solver, update(solver, sides, trace)) if solved is None else solved
@@ -99,7 +99,7 @@ class SolvingProcess:
     def _ask(
         self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None
     ) -> tuple[Any, Any] | None:
-        """Return the process's solver and solution; None where it has gone."""
+        """Return the process's solver and solution; None if the process has died."""
         with self._lock:
             try:
                 self._connection.send((solver, sides, trace is not None))
@@ -112,7 +112,7 @@ class SolvingProcess:
                 self._end()
                 return None
             except BaseException:
-                self._end()  # where the trace failed, it waits for an answer that will not come
+                self._end()  # after an error of the trace, the process waits for an answer that will not come
                 raise
         if kind == "error":
             raise value
@@ -126,22 +126,22 @@ class SolvingProcess:
         self._process, self._ready = None, False
 
     def close(self) -> None:
-        """End the process; what is still asked for is solved for here."""
+        """End the process; requested estimates are computed here."""
         self._closed = True
         if self._process is not None:
-            self._process.kill()  # a thread that waits for it notices, and lets go of the lock
+            self._process.kill()  # a thread that waits for it wakes up and releases the lock
         with self._lock:
             self._end()
 
 
 def update(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> Any:
-    """Solve in this thread; arguments as ``SolvingProcess.update``."""
+    """Solve on this thread; arguments as for ``SolvingProcess.update``."""
     cells, transfer, mirrored, observations, camera = sides
     return solver.update(cells, transfer, mirrored, observations, trace, camera)
 
 
 def serve(descriptor: int) -> None:
-    """Solve what comes through a pipe until it ends: what such a process does."""
+    """Solve the problems that arrive through a pipe, until it is closed; main function of the solving process."""
     import warp_ar.light.recovery  # noqa: F401 - unpickling needs it
 
     connection = Connection(descriptor)
@@ -165,6 +165,6 @@ def serve(descriptor: int) -> None:
 
 
 PROCESS = SolvingProcess()
-"""Solving process of this process."""
+"""Solving process that all pipelines of this process share."""
 atexit.register(PROCESS.close)
 os.register_at_fork(after_in_child=PROCESS._forget)

@@ -1,4 +1,4 @@
-"""Points on what the scene models, where the frame shows how much light falls."""
+"""Points on modelled surfaces, at which the frame measures the incident light."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Array = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Surfaces:
-    """Surface points of a scene, all in the world's frame."""
+    """Surface points of a scene, in the world's frame."""
 
     points: NDArray[Any]
     """Records of ``SurfacePoint``, (n,)."""
     surface: NDArray[np.int64]
-    """Surface of each point, (n,)."""
+    """Index of each point's surface, (n,)."""
     kinds: NDArray[np.int64]
     """``Kind`` of each surface, (surfaces,)."""
     groups: NDArray[np.int64]
-    """Number of the object that a surface belongs to, (surfaces,): faces of one box share it."""
+    """Index of the object of each surface, (surfaces,); the faces of a box share it."""
     overlap: NDArray[np.float32]
-    """Degree to which points share their surface's texture, 0 to 1, (n, n)."""
+    """Degree, 0 to 1, to which two points share their surface's texture, (n, n)."""
 
 
 class _Collector:
@@ -61,16 +61,16 @@ class _Collector:
 
 
 def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
-    """Points on everything physical that the scene models: the printed card, planes and boxes.
+    """Return points on all physical surfaces that the scene models: the printed card, planes and boxes.
 
-    On the card: the centres of all cells, and its quiet zone. On planes: rings around each ball, where its shadow and
-    reflection fall, and a grid around the origin; not on the card (whose size beyond the quiet zone is not known) and
-    not under boxes. On boxes: 5 x 5 per face. Where there are many, the ones that look largest from the ball share a
-    number of points (``SurfaceConfig.planes``, ``boxes``): the others hide light, and nothing is read off them.
+    On the card: the centres of all cells, and points in its quiet zone. On planes: rings around each ball, where its
+    shadow and reflection fall, and a grid around the origin; outside the card (whose margin is unknown) and outside
+    boxes. On boxes: 5 x 5 points per face. If there are many planes or boxes, only the apparently largest ones, seen
+    from the ball, have points (``SurfaceConfig.planes``, ``boxes``); the others only occlude light.
 
     Args:
-        scene: What is modelled.
-        card_only: Leave out all but the card: its paper and its ink.
+        scene: Scene with the surfaces.
+        card_only: Whether to return only points of the card's paper and ink.
     """
     found = _Collector()
     cells, white, side, outline = printed_cells(scene.marker)
@@ -98,8 +98,8 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
 
 
 def _largest(scene: Scene, shape: str, most: int) -> set[int]:
-    """Numbers of the ``most`` proxies of a shape that look largest from the first ball."""
-    # A proxy on a marker of its own moves: a point of it is another one in the next frame.
+    """Return indices of the ``most`` proxies of a shape that look largest from the first ball."""
+    # A proxy with its own marker moves, so that a point on it is not the same in the next frame.
     still = ((number, proxy) for number, proxy in enumerate(scene.proxies) if proxy.marker is None)
     own = [number for number, proxy in still if proxy.shape == shape]
     if len(own) <= most:
@@ -115,7 +115,7 @@ def _largest(scene: Scene, shape: str, most: int) -> set[int]:
 
 
 def _quiet_zone(low: Array, high: Array, side: float) -> Array:
-    """Points on the paper around the print, half a cell beside it, (32, 3)."""
+    """Return points on the paper around the print, half a cell outside it, (32, 3)."""
     along = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None]
     corners = np.array([[low[0], high[1]], high, [high[0], low[1]], low]) + 0.5 * side * np.array(
         [[-1, 1], [1, 1], [1, -1], [-1, -1]]
@@ -125,13 +125,13 @@ def _quiet_zone(low: Array, high: Array, side: float) -> Array:
 
 
 def _plane_points(scene: Scene, plane: Proxy, low: Array, high: Array) -> Array:
-    """Points on a plane, off the card and off boxes, (n, 3).
+    """Return points on a plane outside the card and outside boxes, (n, 3).
 
     Args:
-        scene: What else is modelled.
+        scene: Scene with the card and the boxes.
         plane: The plane.
         low: Least x and y of the marker's print, metres, (2,).
-        high: Greatest, (2,).
+        high: Largest x and y of the marker's print, metres, (2,).
     """
     rotation, at = rotation_matrix(plane.rotate), np.array(plane.at)
     half = 0.5 * np.array(plane.size)
@@ -153,7 +153,7 @@ def _plane_points(scene: Scene, plane: Proxy, low: Array, high: Array) -> Array:
 
 
 def _add_box(found: _Collector, box: Proxy, steps: int, group: int) -> None:
-    """Points on a box's faces, ``steps`` x ``steps`` on each."""
+    """Add ``steps`` x ``steps`` points on each face of a box."""
     rotation, at = rotation_matrix(box.rotate), np.array(box.at)
     half = 0.5 * np.array(box.size)
     middles = (np.arange(steps) + 0.5) / (0.5 * steps) - 1.0
@@ -179,11 +179,11 @@ def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
 def texture_overlap(
     positions: NDArray[Any], surface: NDArray[np.int64], kind: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Return the degree to which points share their surface's texture, 0 to 1, (n, n); 0 where its kind has none.
+    """Return the degree, 0 to 1, to which two points share their surface's texture, (n, n); 0 without texture.
 
     Args:
-        positions: Of the points, metres, (n, 3).
-        surface: That each lies on, (n,).
+        positions: Positions of the points, metres, (n, 3).
+        surface: Index of each point's surface, (n,).
         kind: ``Kind`` of that surface, (n,).
     """
     overlap = np.zeros((len(surface), len(surface)), np.float32)
@@ -199,21 +199,21 @@ def texture_overlap(
 def measured_noise(
     points: NDArray[Any], surface: NDArray[np.int64], kinds: NDArray[np.int64], light: Array, exact: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Relative standard deviation of one equation, by surface: how far its points scatter about a smooth course.
+    """Return the relative standard deviation of an equation by surface, from its points' scatter about a smooth fit.
 
-    The course is a quadratic in the surface's own coordinates, of the logarithm: an emitter's light falls off like
-    that. An even box or card says more than a table's texture, and more than all boxes and cards would have it.
+    The fit is a quadratic in the surface's own coordinates, of the logarithm, like the falloff of an emitter's light.
+    So an even box or card has more weight than a textured table, and more than the usual value for boxes and cards.
 
     Args:
         points: Records of ``SurfacePoint``, (n,).
-        surface: That each lies on, (n,).
+        surface: Index of each point's surface, (n,).
         kinds: ``Kind`` of each surface, (surfaces,).
-        light: pi times the radiance that each shows, (n, 3).
-        exact: Where that does not clip and says something, (n, 3).
+        light: pi times the radiance of each point, (n, 3).
+        exact: True where that value is neither clipped nor too dark, (n, 3).
 
     Returns:
-        Between ``least_noise`` and what is usual for the kind, (surfaces,): cast shadows scatter as well, and they are
-        what is looked for. And how far points scatter, at least what is usual, (surfaces,).
+        Standard deviation between ``least_noise`` and the kind's usual value, (surfaces,): cast shadows scatter as
+        well, and they are evidence. And the measured scatter, at least the usual value, (surfaces,).
     """
     noise = np.array(CONFIG.surfaces.noise)[kinds]
     texture = noise.copy()
@@ -240,11 +240,11 @@ def measured_noise(
 
 
 def shared_errors(overlap: NDArray[np.float32], kind: NDArray[np.int64], seen: NDArray[np.bool_]) -> Array:
-    """Number of equations that share the error of each of the points that are seen.
+    """Return the number of equations that share the error of each visible point.
 
     Args:
-        overlap: From ``texture_overlap``, (n, n).
+        overlap: Result of ``texture_overlap``, (n, n).
         kind: ``Kind`` of each point's surface, (n,).
-        seen: Points that have an equation, (n,).
+        seen: Points with an equation, (n,).
     """
     return np.asarray(np.maximum(np.array(CONFIG.surfaces.shared)[kind], overlap @ seen.astype(np.float32))[seen])
