@@ -1,1 +1,1 @@
-"""Accuracy and its cost: errors, times, the budget that a quality keeps, and the report of both."""
+"""Accuracy and cost of methods: errors, times, reports, and the quality that keeps a time budget."""

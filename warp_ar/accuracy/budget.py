@@ -1,12 +1,12 @@
-"""``--quality auto``: the methods that err least within a time budget, and a change of them when the load changes.
+"""``--quality auto``: the methods of least error within a time budget, adapted to the load.
 
-**Costs.** Errors come from the cost table that is part of the package. Costs depend on the device and on the scene,
-so they are measured here (``warp_ar.accuracy.costs``), on the first frame that shows the marker.
+**Costs.** Errors are those of the package's cost table. Costs depend on device and scene, so they are measured
+(``warp_ar.accuracy.costs``) on the first frame that shows the marker.
 
-**Choice.** What to run is decided by ``warp_ar.accuracy.controller``, from what frames take.
+**Choice.** ``warp_ar.accuracy.controller`` chooses the settings from measured frame times.
 
-**Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``), which lights the next frame
-once it is built and its kernels are loaded.
+**Switching.** Each set of methods has its own pipeline (``warp_ar.engine.switcher``), which lights the next frame when
+it is built and its kernels are loaded.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _KEPT_PIPELINES = 6
 
 
 class AutoPipeline(Closing):
-    """A pipeline that changes its quality to keep to a budget; it is called as ``Pipeline`` is."""
+    """Pipeline that changes its quality to keep a time budget; it is called like ``Pipeline``."""
 
     def __init__(
         self,
@@ -65,23 +65,23 @@ class AutoPipeline(Closing):
         folder: Path | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Start at the base quality; the first frame that shows the marker brings the choice.
+        """Start at the base quality; settings are chosen at the first frame that shows the marker.
 
         Args:
-            scene: What to show.
+            scene: Scene to show.
             budget_ms: Milliseconds per frame, the marker's tracking included.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             size: Width and height of the frames; None means the scene's.
-            outputs: What results shall hold.
+            outputs: Parts of the results, as for ``Pipeline``.
             exposures: As for ``Pipeline``.
             shown: As for ``Pipeline``.
             estimates: As for ``Pipeline``.
-            costs: Known costs; None reads or measures them.
-            folder: Where costs are kept; None means the user's cache folder.
-            clock: Seconds.
+            costs: Known costs; None: they are read from the cache or measured.
+            folder: Folder in which costs are kept; None means the user's cache folder.
+            clock: Clock in seconds.
 
         Raises:
-            UsageError: An argument that cannot be used.
+            UsageError: An argument cannot be used.
             SceneError: The scene's camera does not fit ``size``.
         """
         if not budget_ms > 0.0:
@@ -94,7 +94,7 @@ class AutoPipeline(Closing):
         self._switcher = PipelineSwitcher(device=device, estimates=estimates, keep=_KEPT_PIPELINES - 1)
         self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures), shown)
         self.pipeline = self._switcher.open(self._target)
-        """The one that lights the next frame."""
+        """Pipeline that lights the next frame."""
         self._costs = costs
         self._controller: Controller | None = None
         self._changes: list[dict[str, Any]] = []
@@ -103,15 +103,15 @@ class AutoPipeline(Closing):
         self._told = False
 
     def warm_up(self, progress: Progress | None = None) -> None:
-        """As ``Pipeline.warm_up``, for the settings of the first frame."""
+        """Load kernels as ``Pipeline.warm_up`` does, for the first frame's settings."""
         self.pipeline.warm_up(progress)
 
     def close(self) -> None:
-        """Stop the threads; arrays go when the last result that refers to them does."""
+        """Stop the threads. Arrays are freed with the last result that refers to them."""
         self._switcher.close()
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the pipeline that lights the next frame has by this name: its plan, quality, arrays, device."""
+        """Return an attribute of the pipeline that lights the next frame: its plan, quality, arrays or device."""
         if name == "pipeline":  # not built yet
             raise AttributeError(name)
         return getattr(self.pipeline, name)
@@ -143,10 +143,10 @@ class AutoPipeline(Closing):
         return result
 
     submit = __call__
-    """Frames are not sent ahead: their times must be known before the next one."""
+    """Same as a call: a frame's time must be known before the next one, so frames are not sent ahead."""
 
     def _start(self, image: Any, pose: Pose | None) -> Controller:
-        """Get the costs; the first choice waits for frames that tell the load."""
+        """Read or measure the costs; return a controller that waits for frames that measure the load."""
         if self._costs is None and self.settings:
             key = cost_key(self.plan, self.device, self.settings)
             self._costs = read_costs(self._folder, key, self.settings)
@@ -162,13 +162,13 @@ class AutoPipeline(Closing):
         return turn(BASE, self._base if self._controller is None else self._controller.settings)
 
     def _want(self) -> None:
-        """Go over to the controller's settings, as soon as there is a pipeline for them."""
+        """Request a pipeline for the controller's settings."""
         self._target = dataclasses.replace(self._target, quality=self._wanted())
         if self._switcher.want(self._target, Pipeline.warm_up):
             self._changes.append(self._record())
 
     def _record(self) -> dict[str, Any]:
-        """The controller's settings as those of the next frame."""
+        """Return a record of the controller's settings for the next frame."""
         assert self._controller is not None
         return {
             "frame": self._frames,
@@ -178,7 +178,7 @@ class AutoPipeline(Closing):
         }
 
     def _swap(self) -> None:
-        """Go over to the wanted pipeline if it is ready; one that cannot be built is told, and others are used."""
+        """Switch to the requested pipeline if it is ready; if it cannot be built, report it and choose others."""
         controller = self._controller
         if controller is None:
             return
@@ -196,12 +196,12 @@ class AutoPipeline(Closing):
             controller.shown(self._clock())
 
     def _admit(self, _pipeline: Pipeline, _timing: Any) -> bool:
-        """Let a pipeline that was built light the next frame."""
+        """Accept a newly built pipeline for the next frame."""
         self._changes.append(self._record())
         return True
 
     def _tell(self) -> None:
-        """Say once that the budget is too small."""
+        """Print once that the budget is too small."""
         controller = self._controller
         if controller is not None and not controller.fits and not self._told:
             self._told = True

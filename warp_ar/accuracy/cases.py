@@ -1,4 +1,4 @@
-"""Cases: a scene's frames with their poses, and pictures of the truth where there are any."""
+"""Cases: frames of a scene with their poses, and pictures of the truth if there are any."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from warp_ar.tracking.tracking import Tracker
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 LIGHT_RADIUS = 0.02
-"""Metres, of ``sized_light``: a light bulb."""
+"""Radius in metres of the lights of ``sized_light``: a light bulb."""
 SIZED = ", sized light"
-"""Suffix of the name of such a case."""
+"""Suffix of the names of such cases."""
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
-"""Kinds of truth that a case may have; ``object`` and ``light`` are swept only where there is no ``both``."""
+"""Kinds of truth of a case; ``object`` and ``light`` are used only if there is no ``both``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A scene with frames, and pictures of how it should look."""
+    """Frames of a scene, with pictures of how they should look."""
 
     name: str
     scene: Scene
     frames: tuple[Frame, ...]
     poses: tuple[Pose | None, ...]
     truth: Mapping[int, Image]
-    """Pictures that the camera would have taken, by frame; empty where that is not known."""
+    """Pictures that the camera would have taken, by frame; empty if the truth is unknown."""
     regions: Mapping[int, Mask] = dataclasses.field(default_factory=dict)
-    """Pixels that anything virtual changes, or that clip, where the truth says so."""
+    """Pixels that virtual content changes or that clip, by frame, if the truth states them."""
 
     @property
     def darker(self) -> bool:
-        """Return whether only clipped pixels matter: at another exposure all others are scaled, to rounding."""
+        """Return True if only clipped pixels matter: at another exposure all others are scaled, up to rounding."""
         return is_darker(self.scene)
 
     @property
@@ -56,10 +56,10 @@ class Case:
 
 
 def read_image(path: Path) -> Image:
-    """A picture as uint8 RGB, or RGBA if it says where it is transparent.
+    """Return a picture as uint8 RGB, or RGBA if it has transparency.
 
     Raises:
-        UsageError: It cannot be read.
+        UsageError: The file cannot be read.
     """
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8 or image.ndim != 3:
@@ -69,7 +69,7 @@ def read_image(path: Path) -> Image:
 
 
 def shrink(image: Image, times: int) -> Image:
-    """A picture at a whole fraction of its size."""
+    """Return a picture reduced by an integer factor."""
     if times == 1:
         return image
     size = image.shape[1] // times, image.shape[0] // times
@@ -84,19 +84,19 @@ def load_case(
     times: int = 1,
     first: int = 0,
 ) -> Case:
-    """Read frames, and find the marker in each once.
+    """Read frames and find the marker in each.
 
     Args:
-        name: For tables.
-        scene: Its clip is read.
-        count: Frames at most.
-        truth: By number of the frame in the clip: RGB, or RGBA that is transparent where nothing changes.
-        times: By how much everything is shrunk.
-        first: Number of the first frame.
+        name: Name for tables.
+        scene: Scene whose clip is read.
+        count: Largest number of frames.
+        truth: Pictures by the frame's index in the clip: RGB, or RGBA that is transparent where nothing changes.
+        times: Integer factor by which all pictures are reduced.
+        first: Index of the first frame.
 
     Raises:
         UsageError: The scene names no clip.
-        SourceError: It cannot be read.
+        SourceError: The clip cannot be read.
     """
     if scene.source is None or scene.source.path is None:
         raise UsageError(f"scene {scene.name!r} has no clip to compare methods on; expected [source] path")
@@ -121,24 +121,24 @@ def load_case(
 
 
 def _complete(scene: Scene, camera: Image, truth: Image) -> tuple[Image, Mask]:
-    """The truth's whole picture, and the region in which it says anything that the frame does not."""
+    """Return the complete picture of the truth, and the region in which the truth differs from the frame."""
     scale = scene.exposure.scale
     if truth.shape[2] == 3:
         return truth, clipped_region(camera) if is_darker(scene) else changed_region(camera, truth)
-    # Where the truth is transparent nothing changes but the exposure, and nothing clips.
+    # In transparent pixels only the exposure changes, and nothing clips.
     rest = camera if isinstance(scale, str) else scale_codes(camera, scale, scene.camera.transfer)
     region = truth[..., 3] > 0
     return np.where(region[..., None], truth[..., :3], rest), region
 
 
 def is_darker(scene: Scene) -> bool:
-    """Return whether a scene asks for a shorter exposure and nothing else that the frame does not show."""
+    """Return True if a scene only changes the picture by a shorter exposure."""
     scale = scene.exposure.scale
     return not isinstance(scale, str) and scale < 1.0 and not scene.objects and not scene.lights
 
 
 def scale_codes(image: Image, scale: float, transfer: str | Path) -> Image:
-    """A frame at another exposure, as far as nothing in it clips."""
+    """Return a frame at another exposure, valid in unclipped pixels."""
     values = decode_table(transfer)
     codes = np.arange(256)
     tables = [np.interp(column * scale, column, codes) + 0.5 for column in values.T]
@@ -146,25 +146,25 @@ def scale_codes(image: Image, scale: float, transfer: str | Path) -> Image:
 
 
 def read_truth(folder: Path) -> dict[int, Image]:
-    """Pictures of a folder of ``NNNN.png`` by their numbers."""
+    """Return the pictures ``NNNN.png`` of a folder by their numbers."""
     return {int(path.stem): read_image(path) for path in sorted(folder.glob("*.png"))}
 
 
 def truth_of(scene_file: Path) -> Path | None:
-    """Folder of pictures that a scene file of a case comes with: ``both`` beside ``scene_both.toml``."""
+    """Return the folder of pictures of a case's scene file: ``both`` for ``scene_both.toml``."""
     folder = scene_file.parent / scene_file.stem.removeprefix("scene_")
     return folder if scene_file.stem.startswith("scene_") and folder.is_dir() else None
 
 
 def open_scene(name: str, count: int, times: int = 1) -> Case:
-    """A case from a scene file or a bundled scene, with the truth that it comes with.
+    """Return a case from a scene file or a bundled scene, with its truth.
 
-    Bundled scenes come with one true frame, ``truth/SCENE_NNNN.png``; the frames end with it.
+    A bundled scene has one frame of truth, ``truth/SCENE_NNNN.png``; the case ends with that frame.
 
     Args:
-        name: Of a bundled scene, or a scene file.
-        count: Frames at most.
-        times: By how much everything is shrunk.
+        name: Name of a bundled scene, or a scene file.
+        count: Largest number of frames.
+        times: Integer factor by which all pictures are reduced.
 
     Raises:
         WarpArError: The scene or its clip cannot be read.
@@ -182,14 +182,14 @@ def open_scene(name: str, count: int, times: int = 1) -> Case:
 
 
 def sized_light(case: Case) -> Case:
-    """The case with virtual lights that have a size, whose shadows are soft; what they truly look like is not known."""
+    """Return the case with virtual lights of finite size, which cast soft shadows; its truth is unknown."""
     lights = tuple(dataclasses.replace(light, radius=LIGHT_RADIUS) for light in case.scene.lights)
     scene = dataclasses.replace(case.scene, lights=lights)
     return dataclasses.replace(case, name=case.name + SIZED, scene=scene, truth={}, regions={})
 
 
 def truth_folders(truth: Path) -> list[Path]:
-    """Cases under a folder, or the folder itself if it is one."""
+    """Return the case folders within a folder, or the folder itself if it is a case."""
     return [truth] if (truth / "case.json").is_file() else sorted(path for path in truth.iterdir() if path.is_dir())
 
 
@@ -200,14 +200,14 @@ def open_cases(
     times: int = 1,
     versions: Sequence[str] = VERSIONS,
 ) -> Iterator[Case]:
-    """Scenes, or cases with truth, or both; neither means the bundled scene ``desk``.
+    """Yield cases of scenes, cases with truth, or both; with neither, the bundled scene ``desk``.
 
     Args:
-        scenes: Scene files or names of bundled scenes; ``all`` alone means every bundled one, and ``sized_light``.
-        truth: A case's folder, or one of such folders.
-        count: Frames of each.
-        times: By how much everything is shrunk.
-        versions: Kinds of truth.
+        scenes: Scene files or names of bundled scenes; ``all`` alone means all bundled scenes and ``sized_light``.
+        truth: Folder of a case, or of several case folders.
+        count: Largest number of frames of each case.
+        times: Integer factor by which all pictures are reduced.
+        versions: Kinds of truth to include.
 
     Raises:
         UsageError: A file cannot be read, or ``truth`` holds no case.

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from warp_ar.errors import UsageError
 
 SIZE, SMALL = (5.6, 3.2), (4.0, 2.8)
-"""Width and height of a chart, and of one among many, inches of 100 pixels."""
+"""Width and height of a large and of a small chart, in inches of 100 pixels."""
 _COLORS = {
     "soft": "#5c5f61",
     "ink": "#1b1c1d",
@@ -24,19 +24,19 @@ _COLORS = {
     "other": "#9a9c91",
     "warm": "#c25711",
 }
-"""Colours, as the page has them."""
+"""Colours of the page."""
 _FONT = 9.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """One choice in a chart."""
+    """Choice in a chart."""
 
     label: str
     milliseconds: float
     error: float
     dominated: bool
-    """Another point costs no more and errs no more."""
+    """True if another point costs no more and has no larger error."""
 
 
 def require_plots() -> None:
@@ -58,13 +58,13 @@ def scatter(
     limit: float | None = None,
     size: tuple[float, float] = SIZE,
 ) -> str:
-    """Return a chart of cost, logarithmic, against error: the Pareto front is filled and joined.
+    """Return a chart of logarithmic cost and error; Pareto-optimal points are filled and joined by a line.
 
     Args:
         points: Measured choices.
         x_title: Name of the cost.
         y_title: Name of the error.
-        limit: A cost to mark, in milliseconds: that of a frame at 30 frames per second.
+        limit: Cost in milliseconds to mark, such as that of 30 frames per second.
         size: Width and height in inches of 100 pixels.
     """
     drawing, axes = _axes(x_title, y_title, size)
@@ -89,7 +89,7 @@ def scatter(
     for number, (cost, point) in enumerate(zip(costs, points, strict=True)):
         face, edge = ("card", "other") if point.dominated else ("mark", "mark")
         axes.plot(cost, point.error, "o", markersize=7, markerfacecolor=_COLORS[face], markeredgecolor=_COLORS[edge])
-        # Names of neighbours stand above and below their points in turn.
+        # Names of neighbouring points alternate between above and below.
         below = bool(number % 2) and point.error > 0.2 * axes.get_ylim()[1]
         style = {"color": _COLORS["soft" if point.dominated else "ink"], "fontsize": _FONT, "ha": "center"}
         offset = (0, -15 if below else 8)
@@ -99,7 +99,7 @@ def scatter(
 
 
 def lines(series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]], x_title: str, y_title: str) -> str:
-    """Return a chart of several curves, each with its name, x and y, named in a legend."""
+    """Return a chart of several curves, each given by name, x and y, with a legend."""
     drawing, axes = _axes(x_title, y_title, SIZE)
     looks = itertools.cycle(
         itertools.product(("-", "--", ":"), (_COLORS[name] for name in ("ink", "mark", "warm", "other")))
@@ -111,7 +111,7 @@ def lines(series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]], x_title: s
 
 
 def _axes(x_title: str, y_title: str, size: tuple[float, float]) -> tuple[Any, Any]:
-    """Return an empty drawing and its axes."""
+    """Return an empty figure and its axes."""
     require_plots()
     from matplotlib.figure import Figure
 
@@ -129,7 +129,7 @@ def _axes(x_title: str, y_title: str, size: tuple[float, float]) -> tuple[Any, A
 
 
 def _to_svg(drawing: Any, title: str, description: str) -> str:
-    """Return a drawing as SVG, for a file or the inside of a page: text stays text, ids are its own."""
+    """Return a figure as SVG, for a file or a page; text stays text, and ids are unique."""
     import matplotlib
 
     file = io.StringIO()

@@ -1,13 +1,14 @@
-"""The controller of ``--quality auto`` and of the page's budget: what to run, decided from what frames took.
+"""Controller of ``--quality auto`` and of the page's budget: chooses settings from measured frame times.
 
-A frame should take what its settings cost times the load. Frames are looked at a window at a time, by their median; a
-window in which they take far too long is cut short. Where they take more than the budget, the choice is made anew with
-the load that they tell, so that it takes ``AIM`` of the budget; where they take less than ``LEAST`` of it, and
-something that errs less fits into ``AIM``, that is taken. Between the two nothing changes: this hysteresis is wider
-than the noise of a window's median, so that noise moves nothing.
+The predicted time of a frame is the cost of its settings times the load. Frames are evaluated in windows, by their
+median; a window far above the budget is cut short. Above the budget, settings are chosen anew with the measured load,
+to use ``AIM`` of the budget. Below ``LEAST`` of the budget, settings with a smaller error are chosen if they fit into
+``AIM``. In between nothing changes. This hysteresis is wider than the noise of a window's median, so that noise causes
+no change.
 
-Costs may promise too much. Where frames take more than the budget as soon as something dearer is shown, that is held to
-be its fault, not the load's: what costs as much is not tried again for a while, twice as long each time.
+Predicted costs may be too low. If frames exceed the budget right after more expensive settings were applied, those
+settings are taken to be the cause, not the load. Settings of that cost are not tried again for some time, which doubles
+at each repetition.
 """
 
 from __future__ import annotations
@@ -20,26 +21,26 @@ from warp_ar.accuracy.cost_table import Choice, pareto_front
 from warp_ar.accuracy.costs import Costs, make_method_costs
 
 AIM = 0.92
-"""Share of the budget that is planned for."""
+"""Share of the budget for which settings are chosen."""
 LEAST = 0.82
-"""Share of the budget below which something that errs less is looked for."""
+"""Share of the budget below which settings with a smaller error are searched for."""
 FIRST_WINDOW, WINDOW, LONGEST_WINDOW = 27, 81, 324
-"""Frames of the first window, of the first after a change, and of the longest: each without a change is twice as long.
-Of frames that scatter by a fifth the median is known to 5, 3 and 1.4 %."""
+"""Frames of the first window, of the first after a change, and of the longest; each window without a change is twice as
+long as the last. If frames scatter by a fifth, their medians are known to 5, 3 and 1.4 %."""
 HASTE_FRAMES, HASTE = 9, 1.3
-"""Frames that cut a window short, and the share of the budget that their median must exceed for it."""
+"""Least number of frames of a window that is cut short, and the ratio of its median to the budget from which it is."""
 HELD_SECONDS = 0.5
-"""Shortest time for which settings are held."""
+"""Least time for which settings are kept."""
 SETTLE = 2
-"""Frames after a change that are not counted."""
+"""Frames after a change that are ignored."""
 MEMORY = 60.0
-"""Seconds for which what was too much is not tried again, twice as long each time."""
+"""Seconds for which settings that exceeded the budget are not tried again; doubled at each repetition."""
 MOST_DOUBLINGS = 6
-"""Of that time: to an hour."""
+"""Largest number of doublings of that time, to about an hour."""
 
 
 class Controller:
-    """Chooses settings for a budget, and changes them as frames tell."""
+    """Chooses settings for a budget, and changes them by measured frame times."""
 
     def __init__(
         self,
@@ -48,13 +49,13 @@ class Controller:
         budget_ms: float,
         running: Mapping[str, str] | None = None,
     ) -> None:
-        """Choose by what the costs say, or wait for frames that tell the load.
+        """Choose settings by the costs, or wait for frames that measure the load.
 
         Args:
-            costs: Of this device and scene.
-            errors: By setting and method.
+            costs: Costs on this device and scene.
+            errors: Errors by setting and method.
             budget_ms: Milliseconds per frame.
-            running: Settings that run until the load is known; None: the choice is made at once.
+            running: Settings that run until the load is measured; None: settings are chosen at once.
         """
         self._costs, self._errors, self.budget_ms = costs, errors, budget_ms
         self._front = pareto_front(make_method_costs(costs, errors))
@@ -64,87 +65,87 @@ class Controller:
         self._skip = SETTLE
         self._held_since = -math.inf
         self._entry_factor: float | None = None
-        """Load when the present settings were chosen for erring less, until a window has shown what they take."""
+        """Load when the current, more accurate settings were chosen; None after a window has measured their time."""
         self._ceiling, self._until, self._failures = math.inf, 0.0, 0
-        """Milliseconds above which nothing is tried until a time, and how often that was so."""
+        """Milliseconds from which settings are not tried until a given time, and the number of such failures."""
         self._never = math.inf
-        """Milliseconds from which on nothing can be built."""
+        """Milliseconds from which settings cannot be built."""
         self.chosen = running is None
         """True if the first choice has been made."""
         self.fits = True
-        """False: frames take longer than the budget, and no settings are known to take less."""
+        """False if frames exceed the budget and no known settings are cheaper."""
         self.measured_ms: float | None = None
-        """Median of the last window."""
+        """Median of the last window, milliseconds."""
         self.settings: dict[str, str] = dict(self._best().settings if running is None else running)
         self._lit = self.settings
-        """Those that frames were last said to be lit by."""
+        """Settings by which frames were last lit."""
 
     @property
     def choices(self) -> list[Choice]:
-        """All that a budget may buy, cheapest first; milliseconds are relative to the base, as the costs have them."""
+        """All Pareto-optimal choices, cheapest first; milliseconds are relative to the base, as in the costs."""
         return self._front
 
     @property
     def factor(self) -> float:
-        """Measured time over predicted time: the load."""
+        """Ratio of measured to predicted time: the load."""
         return 1.0 if self._factor is None else self._factor
 
     @property
     def expected_ms(self) -> float:
-        """Milliseconds per frame that the present settings should take under the present load."""
+        """Expected milliseconds per frame of the current settings under the current load."""
         return self.factor * self._cost(self.settings)
 
     @property
     def expected_error(self) -> float:
-        """FLIP above that of the best methods that the cost table expects of the present settings."""
+        """FLIP in excess of the best methods' that the cost table gives for the current settings."""
         return self._error(self.settings)
 
     def _error(self, settings: Mapping[str, str]) -> float:
         return sum(self._errors[pair[0]][pair[1]] for pair in settings.items())
 
     def _cost(self, settings: Mapping[str, str]) -> float:
-        """Return milliseconds without the load."""
+        """Return the predicted milliseconds of settings, without the load."""
         return max(self._costs.base + self._costs.excess(settings), 1e-3)
 
     def _best(self) -> Choice:
-        """Return the least error within the budget's aim and below the ceiling; the cheapest if none fits."""
+        """Return the choice of least error within the aim and below the ceiling; the cheapest if none fits."""
         limit = min(AIM * self.budget_ms / self.factor, self._ceiling) - self._costs.base
         never = self._never - self._costs.base
         fitting = [choice for choice in self._front if choice.milliseconds <= limit and choice.milliseconds < never]
-        return fitting[-1] if fitting else self._front[0]  # the Pareto front's errors fall
+        return fitting[-1] if fitting else self._front[0]  # errors decrease along the Pareto front
 
     def set_budget(self, budget_ms: float) -> None:
-        """Choose anew for another budget; the load is taken to be the same."""
+        """Choose settings for another budget, with the same load."""
         self.budget_ms, self._ceiling, self._entry_factor = budget_ms, math.inf, None
         self.settings = dict(self._best().settings)
         self.restart()
 
     def restart(self) -> None:
-        """Forget the frames so far: what they took says nothing of those to come."""
+        """Discard measured frames, if they do not represent the next ones."""
         self._times.clear()
         self._skip, self._window = SETTLE, WINDOW
 
     def shown(self, now: float) -> None:
-        """Note that frames are lit by the present settings from now on."""
+        """Note that frames are lit by the current settings from now on."""
         self._held_since, self.chosen, self._lit = now, True, self.settings
         self.restart()
 
     def reject(self) -> None:
-        """Choose anew, for the present settings cannot be built here: half-way back to those that frames are lit by."""
+        """Choose cheaper settings because the current ones cannot be built: half-way back to those in use."""
         lit, cost = self._cost(self._lit), self._cost(self.settings)
         self._never, self._entry_factor = (0.5 * (lit + cost) if cost > 1.01 * lit else lit), None
         self.settings = dict(self._best().settings) if self._never > lit else dict(self._lit)
         self.restart()
 
     def observe(self, milliseconds: float, now: float) -> bool:
-        """Note what a frame took.
+        """Take the time of a frame.
 
         Args:
-            milliseconds: Of the whole frame.
-            now: Seconds on any clock that does not jump.
+            milliseconds: Time of the whole frame.
+            now: Seconds on a monotonic clock.
 
         Returns:
-            Whether ``settings`` changed.
+            True if ``settings`` changed.
         """
         if self._skip > 0:
             self._skip -= 1
@@ -178,7 +179,7 @@ class Controller:
         return True
 
     def _tell_apart(self, measured: float, now: float, *, over: bool) -> None:
-        """Find whether what frames took is due to the load or to settings that were just shown."""
+        """Attribute the measured time to the load, or to settings that were just applied."""
         entry, self._entry_factor = self._entry_factor, None
         cost = self._cost(self.settings)
         if not over or entry is None:

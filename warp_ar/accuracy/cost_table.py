@@ -1,11 +1,12 @@
-"""Settings of a quality, the cost and the error of each, and the choice for a budget.
+"""Settings of a quality, the cost and the error of their methods, and the choice for a budget.
 
-A **setting** is a stage with several methods, or a number or way of ``Quality`` that several stages share. A **cost**
-is what one method of one setting costs in milliseconds and errs in FLIP. Both are taken to add up: costs because stages
-run one after another, errors because each is the excess over the setting's best method, mean over the same pixels.
+A **setting** is a stage with several methods, or a number or method of ``Quality`` that several stages share. The
+**cost** of a method is its time in milliseconds, and its error is in FLIP. Both are assumed to be additive: costs
+because stages run one after another, errors because each is the excess over the setting's best method, averaged over
+the same pixels.
 
-Choosing is then a small knapsack problem with one item per setting, solved exactly: settings are joined one by one, and
-of the joined choices those are dropped that cost no less and err no less than another.
+The choice is a small knapsack problem with one item per setting, solved exactly: settings are joined one by one, and
+joined choices that are dominated in cost and error are dropped.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.request import Request
 
 COST_TABLE = "cost_table.json"
-"""The committed errors, beside this file."""
+"""File of the committed errors, next to this module."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """Something that a quality can turn."""
+    """Part of a quality that can be varied."""
 
     name: str
-    """A stage's, or a field's of ``Quality``."""
+    """Name of a stage, or of a field of ``Quality``."""
     methods: tuple[str, ...]
-    """Cheapest first; the last is the reference."""
+    """Methods, cheapest first; the last is the reference."""
     stages: tuple[str, ...]
     """Stages whose work it changes."""
 
@@ -49,12 +50,12 @@ class Setting:
 
     @property
     def converges(self) -> bool:
-        """Return whether its methods approximate the last of them; others are models of their own."""
+        """Return True if all methods approximate the last; False if they are different models."""
         return self.name in _SHARED or any(stage.converges for stage in STAGES if stage.name == self.name)
 
 
 def _shared(name: str, *methods: str) -> Setting:
-    """A setting that stages share: those that say so."""
+    """Return a setting that several stages share, with the stages that declare it."""
     return Setting(name, methods, tuple(stage.name for stage in STAGES if name in stage.settings))
 
 
@@ -83,7 +84,7 @@ SETTINGS: tuple[Setting, ...] = (
     _shared("area_light", *AREA_SAMPLES),
     *(Setting(stage.name, tuple(stage.methods), (stage.name,)) for stage in _CHOICES),
 )
-"""All there are."""
+"""All settings."""
 WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
     **_SHARED,
     **{stage.name: (stage.subject, stage.methods) for stage in _CHOICES},
@@ -94,11 +95,11 @@ NUMBERS = ("environment_height", "edge_samples")
 
 
 _LIGHT_ONLY = {stage.name: stage.unseen_method for stage in STAGES if stage.unseen_method} | {"edge_samples": "1"}
-"""Methods of what only shows the light, for frames that nobody looks at."""
+"""Methods of stages without effect on the light, for frames that are not shown."""
 
 
 def chosen(quality: Quality, setting: Setting) -> str:
-    """Method that ``quality`` has the setting on; one that it does not name is on the stage's own default, the last."""
+    """Return the method of a setting in ``quality``; if it is not named, the stage's default, the last."""
     if setting.name in NUMBERS:
         return str(getattr(quality, setting.name))
     method = quality.method(setting.name)
@@ -106,10 +107,10 @@ def chosen(quality: Quality, setting: Setting) -> str:
 
 
 def turn(quality: Quality, settings: Mapping[str, str]) -> Quality:
-    """``quality`` with some settings on other methods.
+    """Return ``quality`` with other methods for some settings.
 
     Raises:
-        UsageError: There is no such setting or method.
+        UsageError: A setting or a method is unknown.
     """
     known = {setting.name: setting for setting in SETTINGS}
     numbers: dict[str, int] = {}
@@ -127,12 +128,12 @@ def turn(quality: Quality, settings: Mapping[str, str]) -> Quality:
 
 
 def light_only(quality: Quality) -> Quality:
-    """The same light, cheaply shown: for frames that only bring it."""
+    """Return the quality with the same light, but cheap methods for the picture, for frames that are not shown."""
     return turn(quality, _LIGHT_ONLY)
 
 
 def relevant_settings(scene: Scene, size: tuple[int, int]) -> tuple[Setting, ...]:
-    """Settings that change what the scene shows or costs."""
+    """Return the settings that change the picture of a scene, or its cost."""
     plan = make_plan(Request(scene, PRESETS["reference"], size))
     running = {stage.name for stage, _ in plan.stages}
     needed = {
@@ -152,12 +153,12 @@ class MethodCost:
     method: str
     milliseconds: float
     error: float
-    """FLIP, as the cost table defines it."""
+    """Error in FLIP, as the cost table defines it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """A method for every setting, and what they cost and err together."""
+    """A method for every setting, with their total cost and error."""
 
     settings: tuple[tuple[str, str], ...]
     milliseconds: float
@@ -165,7 +166,7 @@ class Choice:
 
 
 def pareto_front(method_costs: Sequence[MethodCost]) -> list[Choice]:
-    """Return every choice than which no other costs less and errs less, of all settings; cheapest first."""
+    """Return the Pareto-optimal choices of all settings, cheapest first."""
     settings: dict[str, list[MethodCost]] = {}
     for method_cost in method_costs:
         settings.setdefault(method_cost.setting, []).append(method_cost)
@@ -188,7 +189,7 @@ def pareto_front(method_costs: Sequence[MethodCost]) -> list[Choice]:
 
 
 def choose(front: Sequence[Choice], budget_ms: float) -> Choice:
-    """Return the least error of a Pareto front within a budget; the cheapest choice if none fits."""
+    """Return the choice of least error in a Pareto front within a budget; the cheapest if none fits."""
     fitting = [choice for choice in front if choice.milliseconds <= budget_ms]
     return fitting[-1] if fitting else front[0]
 
@@ -201,22 +202,22 @@ def _load_table() -> dict[str, Any]:
 
 
 def load_errors() -> dict[str, dict[str, float]]:
-    """Return the error of every method of every setting, from the cost table that comes with the package."""
+    """Return the error of every method of every setting, from the package's cost table."""
     return read_errors(_load_table())
 
 
 def load_presets(scene: str, value: str = "error") -> dict[str, float]:
-    """Return each preset's ``error`` or ``ms``, of whole frames: a bundled scene's own, else the mean of all."""
+    """Return ``error`` or ``ms`` of each preset's whole frames: of the bundled scene, else the mean of all scenes."""
     presets = [own for own in _load_table()["presets"].values() if all(value in one for one in own.values())]
     found = [own for own in presets if own is _load_table()["presets"].get(scene)] or presets
     return {name: sum(own[name][value] for own in found) / len(found) for name in found[0]}
 
 
 def read_errors(cost_table: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return the errors of a cost table; a method that it does not know errs as its next cheaper one.
+    """Return the errors of a cost table; a method without an entry has the error of the next cheaper one.
 
     Raises:
-        UsageError: The table has no errors, or one that is no number.
+        UsageError: The table has no errors, or one that is not a number.
     """
     listed = cost_table.get("errors")
     if not isinstance(listed, Mapping):

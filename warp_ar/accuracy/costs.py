@@ -1,6 +1,6 @@
-"""The cost of every method on this device: measured on one frame, and kept in the user's cache folder.
+"""Costs of all methods on this device, measured on one frame and kept in the user's cache folder.
 
-Costs depend on the device and on the scene. They are measured one setting at a time from a base.
+Costs depend on the device and on the scene. They are measured by varying one setting at a time from a base preset.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ from warp_ar.stages.recover import EVERY_FRAME
 from warp_ar.tracking.tracking import Tracker
 
 BASE = PRESETS["medium"]
-"""Preset that costs are measured from, and that runs until something is chosen."""
+"""Preset from which costs are measured, and which runs until settings are chosen."""
 MEASURED_FRAMES = 6
-"""Frames that tell what a method costs."""
+"""Number of frames by which a method is timed."""
 _WARM_UP = 1
 NOW_AND_THEN = "recover"
-"""Stage that works some times a second on a thread of its own: what it takes is shown by all that the process works."""
+"""Stage that works some times a second on a separate thread; its cost is measured from the process's total work."""
 _SPREAD_FRAMES = 12
-"""Frames over which that is taken: two of its turns."""
+"""Number of frames for that measurement, which contain two runs of the stage."""
 _ENOUGH_MS = 200.0
-"""Expensive methods use fewer frames: their relative noise is small."""
+"""Total milliseconds after which a measurement ends: expensive methods use fewer frames, as their noise is small."""
 WORK = time.thread_time
-"""Clock that counts what a thread works: other programs that are busy at the same time then hardly matter."""
+"""Clock of a thread's processor time, on which other programs have little effect."""
 _CACHE_FILE = "costs.json"
 
 
 @dataclasses.dataclass(frozen=True)
 class Costs:
-    """The times of a device for a scene."""
+    """Times of a scene's methods on a device."""
 
     base: float
-    """Milliseconds per frame of the preset that methods were measured from, tracking included."""
+    """Milliseconds per frame of the base preset, tracking included."""
     methods: Mapping[str, Mapping[str, float]]
     """Milliseconds per frame above the base, by setting and method."""
     track: float = 0.0
     """Milliseconds of ``base`` that tracking takes."""
 
     def excess(self, settings: Mapping[str, str]) -> float:
-        """Return the milliseconds per frame that settings should take more than the base."""
+        """Return the expected milliseconds per frame of settings in excess of the base."""
         return sum(self.methods[setting][method] for setting, method in settings.items())
 
 
 def make_method_costs(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[MethodCost]:
-    """Costs measured on a device beside errors by setting and method."""
+    """Return a list that joins the device's costs with errors, by setting and method."""
     return [
         MethodCost(setting, method, milliseconds, errors[setting][method])
         for setting, own in costs.methods.items()
@@ -71,7 +71,7 @@ def make_method_costs(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -
 
 
 def measure_costs(*arguments: Any, **options: Any) -> Costs:
-    """Take all steps of ``measure_steps`` at once; arguments are the same."""
+    """Run all steps of ``measure_steps`` and return the costs; the arguments are the same."""
     steps = measure_steps(*arguments, **options)
     while True:
         try:
@@ -91,18 +91,18 @@ def measure_steps(
     *,
     all_methods: bool = False,
 ) -> Generator[float, None, Costs]:
-    """Time methods on one frame that is shown again and again, in small steps; yield the share that is done.
+    """Time methods on one repeated frame, in small steps; yield the completed share, and return the costs.
 
     Args:
         scene: Scene that is shown.
         image: uint8 RGB (height, width, 3).
-        pose: Of the camera in that frame, if the scene needs it.
+        pose: Camera pose of that frame, if the scene needs it.
         device: ``cpu`` or ``cuda:N``.
         size: Width and height.
-        settings: Settings that may be turned.
-        clock: Seconds, on CPU. None counts processor time, so that other programs matter little, and takes it by the
-            ratio in which the base's stands to the time that passes.
-        all_methods: True to time brute force too.
+        settings: Settings to vary.
+        clock: Clock in seconds, on CPU. None measures processor time, on which other programs have little effect,
+            scaled by the ratio of elapsed to processor time of the base.
+        all_methods: Whether to time brute force too.
     """
     methods = {setting: setting.methods if all_methods else setting.measured for setting in settings}
     count, done = sum(map(len, methods.values())) + 2, 2
@@ -127,7 +127,7 @@ def measure_steps(
                 times[method].pop(TRACK, None)
             done += 1
             yield done / count
-        # Stages that run whatever the method is cost the same: what was measured of them is noise.
+        # Stages that all methods of a setting share cost the same; measured differences between them are noise.
         common = set.intersection(*(set(own) for own in times.values())) - set(setting.stages)
         own = {method: sum(ms for name, ms in stages.items() if name not in common) for method, stages in times.items()}
         costs[setting.name] = {method: pace * (ms - own[start]) for method, ms in own.items()}
@@ -144,7 +144,7 @@ def _time_stages(
     clock: Callable[[], float],
     spread: bool = False,
 ) -> dict[str, float]:
-    """Milliseconds by stage, tracking among them where the clock is that of the time that passes."""
+    """Return milliseconds by stage; with a clock of elapsed time also those of tracking."""
     times: dict[str, list[float]] = {}
     spent = 0.0
     warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, MEASURED_FRAMES)
@@ -177,7 +177,7 @@ def _time_stages(
 
 
 def show_again(pipeline: Pipeline, image: Any, pose: Pose | None, index: int) -> Result:
-    """Light one picture as the ``index``-th frame, a little darker every other time, with every stage at work."""
+    """Light a picture as the ``index``-th frame, slightly darker in every second one, so that every stage runs."""
     pipeline.scheduler.forget()
     shown = image - image // 8 if index % 2 else image
     return pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
@@ -186,7 +186,7 @@ def show_again(pipeline: Pipeline, image: Any, pose: Pose | None, index: int) ->
 def open_profiled(
     scene: Scene, device: str, quality: Quality, size: tuple[int, int] | None, clock: Callable[[], float]
 ) -> Pipeline:
-    """A pipeline whose stages are timed by a clock; by ``WORK`` one thread does them, one after another."""
+    """Return a pipeline whose stages are timed by ``clock``; with ``WORK`` one thread runs them one after another."""
     bands = 1 if clock is WORK else None
     pipeline = Pipeline(scene, device=device, quality=quality, size=size, bands=bands, profile=True)
     pipeline.scheduler.clock = clock
@@ -194,12 +194,12 @@ def open_profiled(
 
 
 def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
-    """Milliseconds that the process's work takes: by ``WORK`` all of it, by the time its share on every core."""
+    """Return the milliseconds of the process's work: all of it with ``WORK``, else divided by the number of cores."""
     return seconds * 1e3 / (1 if clock is WORK else usable_cores())
 
 
 def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
-    """Return a digest of all that costs depend on: device, versions, stages, scene, the frames' size, the methods."""
+    """Return a digest of all that costs depend on: device, versions, stages, scene, frame size and methods."""
     scene = plan.request.scene
     parts = [
         device.name,
@@ -217,7 +217,7 @@ def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
 
 
 def package_version() -> str:
-    """Of this package; a checkout that is not installed has none."""
+    """Return the version of this package; a checkout that is not installed has none."""
     try:
         return importlib.metadata.version("warp-ar")
     except importlib.metadata.PackageNotFoundError:
@@ -225,7 +225,7 @@ def package_version() -> str:
 
 
 def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | None:
-    """Kept costs, or None where there are none that can be used."""
+    """Return the kept costs; None if there are none or they cannot be used."""
     try:
         kept = json.loads((folder / _CACHE_FILE).read_text(encoding="utf-8"))[key]
         methods = {
@@ -237,11 +237,11 @@ def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | N
         )
         return Costs(float(kept["base"]), methods, float(kept["track"])) if known else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None  # not there, or not ours: it is measured anew
+        return None  # no file, or not of this program: costs are measured again
 
 
 def write_costs(folder: Path, key: str, costs: Costs) -> None:
-    """Keep costs beside those of other devices and scenes; where nothing can be written, they are measured again."""
+    """Keep costs next to those of other devices and scenes; if they cannot be written, they are measured again."""
     path = folder / _CACHE_FILE
     try:
         everything = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""A frame of a scene with all that the pipeline knows of it: its pose, its light, and the picture that it made."""
+"""A frame of a scene with the pipeline's knowledge of it: pose, light, and lit picture."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _LOG = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class KnownFrame:
-    """A frame, and what the pipeline knew when it lit it."""
+    """A frame, with the pipeline's pose, light and picture."""
 
     scene: Scene
-    """The scene, its camera scaled to the frame's size."""
+    """Scene with its camera scaled to the frame's size."""
     image: Image
     """The camera's picture."""
     lit: Image
@@ -40,11 +40,11 @@ class KnownFrame:
     light: Light
     """Light of the environment; emitters of known distance are in ``Light.emitters``."""
     seconds: float
-    """Since the first frame."""
+    """Time since the first frame."""
     milliseconds: float
-    """That its stages took."""
+    """Total time of the frame's stages."""
     balls: int = 1
-    """Mirror balls between which the pipeline interpolates its light; ``light`` is that of the first alone."""
+    """Number of mirror balls between which the pipeline interpolates light; ``light`` is the first one's only."""
 
     def tracer(
         self,
@@ -54,7 +54,7 @@ class KnownFrame:
         seed: int = 0,
         light_samples: int = LIGHT_SAMPLES,
     ) -> PathTracer:
-        """A path tracer of this frame; arguments as those of ``PathTracer``."""
+        """Return a path tracer of this frame; the arguments are those of ``PathTracer``."""
         if self.balls > 1:
             _tell_first(self.scene.name, self.balls)
         return PathTracer(
@@ -70,10 +70,10 @@ class KnownFrame:
         )
 
     def placed(self, *, device: str = "auto") -> KnownFrame:
-        """The same with the distances of its light's emitters, where none is known, as far as the frame tells them.
+        """Return this frame with estimated distances of its light's emitters, if none was known.
 
         Raises:
-            UsageError: The scene has no mirror ball, or the frame shows no proxy well enough.
+            UsageError: The scene has no mirror ball, or the frame does not show a proxy sufficiently.
         """
         light = place_emitters(self.light, self.scene, self.image, self.pose, device=device, seconds=self.seconds)
         return dataclasses.replace(self, light=light)
@@ -81,7 +81,7 @@ class KnownFrame:
 
 @functools.cache
 def _tell_first(scene: str, balls: int) -> None:
-    """Say once that a reference does not know what the other balls show."""
+    """Print once that a reference uses only the first ball's light."""
     _LOG.warning(
         "%s: the path tracer's light is that of the first of %d mirror balls, everywhere; the pipeline's is "
         "interpolated between them, so the two differ away from the first",
@@ -98,18 +98,18 @@ def light_up_to(
     device: str = "auto",
     source: str | int | Path | None = None,
 ) -> KnownFrame:
-    """Run a scene's frames through a pipeline up to one of them.
+    """Light a scene's frames by a pipeline, up to one of them, and return that one.
 
     Args:
-        scene: What to light.
-        number: Of the frame, from 0.
-        quality: Of the pipeline, and so of the light that it finds.
+        scene: Scene to light.
+        number: Index of the frame.
+        quality: Quality of the pipeline, which determines the accuracy of the light.
         device: ``auto``, ``cpu`` or ``cuda:N``.
-        source: Frames instead of the scene's own.
+        source: Frames to use in place of the scene's own.
 
     Raises:
         SceneError: The scene cannot be used.
-        SourceError: The source ends before the frame, or the frame cannot be judged.
+        SourceError: The source ends before the frame, or the frame cannot be path-traced.
         UsageError: Any other argument cannot be used.
     """
     if number < 0:
@@ -145,7 +145,7 @@ def light_up_to(
 
 
 def known_frame(pipeline: Pipeline, image: Image, result: Result, seconds: float) -> KnownFrame:
-    """Return what a path tracer needs of the frame that a pipeline has just lit, with a pose, at some seconds."""
+    """Return the data that a path tracer needs of the frame that a pipeline has just lit."""
     assert result.pose is not None
     others = pipeline.plan.features.others
     with exclusive(pipeline.device):
@@ -155,7 +155,7 @@ def known_frame(pipeline: Pipeline, image: Image, result: Result, seconds: float
 
 
 def exposed_scene(pipeline: Pipeline) -> Scene:
-    """A pipeline's scene with the exposure that its last frame had, where it chooses that itself."""
+    """Return the pipeline's scene; an automatic exposure is replaced by that of the last frame."""
     scale = pipeline.arrays.get("expose_scale")
     if scale is None:
         return pipeline.scene
@@ -163,7 +163,7 @@ def exposed_scene(pipeline: Pipeline) -> Scene:
 
 
 def light_of(pipeline: Pipeline) -> Light:
-    """The light that a pipeline knows; black where the scene calls for none."""
+    """Return the pipeline's current light; black if the scene needs none."""
     arrays = pipeline.arrays
     radiance: npt.NDArray[np.float32] = np.zeros((2, 4, 3), np.float32)
     if arrays.get("environment") is not None:
@@ -183,7 +183,7 @@ def _triple(values: npt.NDArray[np.float32]) -> tuple[float, float, float]:
 
 
 def _emitter(record: np.void, distance: float | None, height: int) -> CapturedEmitter:
-    """An emitter that the pipeline found; it is taken to fill one texel."""
+    """Return an emitter from the pipeline's record, with the solid angle of one texel."""
     direction, origin, power = (_triple(record[name]) for name in ("direction", "origin", "power"))
     size = float(texel_solid_angles(height)[height // 2, 0])
     return CapturedEmitter(direction, size, power, power, None, distance, origin)

@@ -1,15 +1,15 @@
-"""Distances of the emitters of a given light, by what a frame's surfaces show.
+"""Distances of a given light's emitters, estimated from the surfaces in a frame.
 
-Light that a file gives is light as one point sees it: it says in which direction an emitter stands, not how far. Taken
-for distant, a lamp half a metre away lights all of a desk alike, and its shadows fall in one direction. The frame knows
-better. With the right distances the reflectance that it tells of a desk, radiance over irradiance, is the same
-everywhere but for texture; with wrong ones it falls off across the desk, and has shadows in it that are no shadows and
-lights where there should be shadows. So emitters are placed one after another, the most powerful first, where the
-reflectance of each proxy scatters least:
+Light from a file is measured at one point: it contains the direction of an emitter, not its distance. If a lamp half a
+metre away is treated as distant, it lights the whole desk evenly, with parallel shadows. The frame determines the
+distances: with the right ones, the desk's reflectance (radiance over irradiance) is constant except for texture. With
+wrong ones the estimated reflectance falls off across the desk and contains false shadows and false lights. So emitters
+are placed one after another, the most powerful first, at the distance with the least scatter of each proxy's
+reflectance:
 
     cost = mean over pixels of log(1 + (r / GRAIN)^2),    r = log(reflectance) - its median over the proxy,
 
-by the path tracer, which knows shadows, interreflection and balls. ``Light.save`` keeps what was found.
+computed by the path tracer, which includes shadows, interreflection and balls. ``Light.save`` stores the result.
 """
 
 from __future__ import annotations
@@ -27,37 +27,37 @@ from warp_ar.light.config import CONFIG
 from warp_ar.scene import Pose, Scene
 
 WIDTH = 160
-"""Width, pixels, of the pictures that measure reflectance."""
+"""Width in pixels of the pictures in which reflectance is measured."""
 SAMPLES = 16
-"""Samples of each of their pixels."""
+"""Samples per pixel of these pictures."""
 GRAIN = 0.1
-"""Deviation of a reflectance's logarithm, about that of wood or paper, beyond which it counts less and less."""
+"""Deviation of the logarithm of reflectance beyond which it has less weight: about that of wood or paper."""
 SHOWN = (0.01, 0.95)
-"""Radiance between which a pixel tells reflectance, in camera values."""
+"""Range of radiance, in camera values, in which a pixel measures reflectance."""
 LEAST_PIXELS = 50
-"""Least number of a proxy's pixels for an estimate."""
+"""Least number of pixels of a proxy for an estimate."""
 WORTH = 0.1
-"""Fall of the cost, as a share of it, that a place must be worth: grain and clutter look like shadows by chance."""
+"""Least relative decrease of the cost for a distance: grain and clutter resemble shadows by chance."""
 MOST = 3
-"""Emitters that are placed at most."""
+"""Largest number of emitters with an estimated distance."""
 NEAREST, FARTHEST = 0.25, 2.0
-"""Metres: nearer ones would stand in the picture, and farther ones are as good as distant."""
+"""Least and largest trial distance, metres: nearer emitters would be visible, farther ones count as distant."""
 BOUND = 0.9 * FARTHEST
-"""Metres beyond which nothing is placed: what does best where the search ends has no place, such as paint that is
-darker toward one side under light from afar."""
+"""Largest accepted distance, metres. A minimum at the end of the search has other causes, such as paint that is darker
+on one side."""
 STEPS = 6
-"""Steps of the search between two tried distances."""
+"""Steps of the search between two trial distances."""
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 def reflectance_scatter(tracer: PathTracer) -> float:
-    """Return the scatter of the reflectance that a frame tells over each proxy: the cost above.
+    """Return the scatter of the estimated reflectance over each proxy: the cost of the module's docstring.
 
     Args:
-        tracer: Of the frame, in the light that is judged.
+        tracer: Path tracer of the frame, with the light to evaluate.
 
     Raises:
-        UsageError: No proxy is shown well enough to tell.
+        UsageError: The frame does not show a proxy sufficiently.
     """
     reflectance, shown, frame = tracer.reflectance(), tracer.shown(), tracer.frame()
     usable = (frame.min(axis=2) > SHOWN[0]) & (frame.max(axis=2) < SHOWN[1])
@@ -82,19 +82,19 @@ def place_emitters(
     device: str = "auto",
     seconds: float = 0.0,
 ) -> Light:
-    """The light with the distances of its emitters, as far as the frame tells them.
+    """Return the light with estimated distances of its emitters, as far as the frame determines them.
 
     Args:
-        light: As the first mirror ball of the scene sees it, in the world's axes; an image is latlong (h, 2 h, 3). A
-            light that has an emitter of known distance is returned as it is.
-        scene: Whose proxies tell.
-        frame: What the camera saw, (H, W, 3), without anything virtual.
+        light: Light at the first mirror ball of the scene, in the world's axes; an image is latlong (h, 2 h, 3). A
+            light with an emitter of known distance is returned unchanged.
+        scene: Scene with the proxies.
+        frame: Camera frame, (H, W, 3), without virtual content.
         pose: ``camera_from_world``.
         device: ``auto``, ``cpu`` or ``cuda:N``.
-        seconds: Since the first frame.
+        seconds: Time since the first frame.
 
     Raises:
-        UsageError: The scene has no ball, from whose centre distances count, or shows no proxy.
+        UsageError: The scene has no ball, from whose centre distances are measured, or the frame shows no proxy.
     """
     if not isinstance(light, Light):
         light = Light(np.asarray(light, np.float32), np.ones(light.shape[:2], np.float32))
@@ -124,14 +124,14 @@ def place_emitters(
 
 
 def _at(light: Light, number: int, distance: float) -> Light:
-    """The light with one emitter at a distance."""
+    """Return the light with one emitter at a given distance."""
     emitters = list(light.emitters)
     emitters[number] = dataclasses.replace(emitters[number], distance=distance)
     return dataclasses.replace(light, emitters=tuple(emitters))
 
 
 def _placed(light: Light, number: int, cost: Callable[[Light], float]) -> tuple[Light, float]:
-    """The light with one emitter at the distance of least cost, which is returned too: a grid, then golden sections."""
+    """Return the light with one emitter at the distance of least cost, and the cost; by a grid and golden sections."""
     distances = sorted({NEAREST, FARTHEST, *CONFIG.search.distances})
     costs = [cost(_at(light, number, distance)) for distance in distances]
     best = int(np.argmin(costs))

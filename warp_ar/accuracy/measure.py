@@ -1,15 +1,14 @@
-"""Measurement of cases: every method of every setting, whole presets, our choice in the paper's time and at its error.
+"""Measurement of cases: all methods of all settings, presets, and our choices at the paper's time and at its error.
 
-**A method's error.** Where the methods approximate one quantity that the last of them gives (``converges``), it is the
-distance from the last: nearer to the truth than the exact light would be is luck, for something else is wrong then.
-Where methods are models of their own, it is the distance from the truth, less that of the best. Distances are FLIP,
-summed over the picture and divided by the pixels that anything virtual changes, so that errors of different settings
-are on one scale.
+**Error of a method.** If all methods approximate the last one's result (``converges``), it is the distance from that
+result: a method that is closer to the truth than the exact solution is so by chance, because another stage is
+inaccurate. If methods are different models, it is the distance from the truth minus that of the best method. Distances
+are FLIP, summed over the picture and divided by the number of pixels that virtual content changes, so that the errors
+of all settings have one scale.
 
-**A method's cost** is what its stages take more than those of the setting's cheapest method, as ``--quality auto``
-measures it. Presets, and the choices that the cost table offers for the paper's time and for its error, are timed as
-whole frames, one frame of each in turn. Choices are made from the committed errors, not from those of the case that
-they are scored on.
+**Cost of a method** is the time of its stages in excess of the setting's cheapest method, measured as by ``--quality
+auto``. Presets, and the choices of the cost table at the paper's time and error, are timed as whole frames, one frame
+of each in turn. Choices are based on the committed errors, not on the errors of the measured case.
 """
 
 from __future__ import annotations
@@ -40,23 +39,23 @@ from warp_ar.stages.quality import PRESETS, Quality
 
 Clock = Callable[[], float]
 Tell = Callable[[str], object]
-"""Told of all that has been done, in words."""
+"""Function that receives a description of each finished step."""
 BASE = PRESETS["high"]
-"""Preset of all settings but the one that is turned."""
+"""Preset of all settings except the varied one."""
 WARM_UP = 3
-"""Frames of a run that are not timed: modules load, caches fill."""
+"""Frames of a run that are not timed, because modules are loaded and caches filled."""
 RUNS = ("paper", "low", "medium", "high")
-"""Presets that are run as a whole."""
+"""Presets to measure as a whole."""
 SAME_TIME, SAME_ERROR = "ours near the paper's time", "ours near the paper's error"
-"""Labels of choices that the cost table offers; their time and their error are measured beside the presets'."""
+"""Names of the choices of the cost table; their time and error are measured together with the presets'."""
 COST_NOISE, FLIP_NOISE = 0.03, 2e-4
 """Measurement noise: relative for costs, in FLIP for pictures."""
 _FAIR: Mapping[str, Mapping[str, str]] = {
     "unwrap": {"environment_height": "32"},
     "environment_height": {"environment_shadow": "none", "recover": "white_card"},
 }
-"""Other methods at which a setting is turned: footprints on the ball matter where texels are coarse; what few rays of
-another map happen to meet, and how its energy is shared among emitters, would hide what the map's own size does."""
+"""Other methods with which a setting is measured. Footprints on the ball matter only with coarse texels. For the map's
+size, few random rays and the division of its energy among emitters would hide its own effect."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,48 +66,48 @@ class Row:
     setting: str
     method: str
     milliseconds: float
-    """More than the setting's cheapest method takes, per frame."""
+    """Milliseconds per frame in excess of the setting's cheapest method."""
     flip: float
     """Mean FLIP of the picture per changed pixel."""
     against: str
-    """``truth`` or ``last method``."""
+    """Reference of ``flip``: ``truth`` or ``last method``."""
     error: float = 0.0
-    """Error that counts, as the module's text defines it."""
+    """Error as the module's docstring defines it."""
     dominated: bool = False
-    """Another method costs no more and errs no more."""
+    """True if another method costs no more and has no larger error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Whole:
-    """A preset or a choice, run as a whole."""
+    """A preset or a choice, measured as a whole."""
 
     label: str
     milliseconds: float
-    """Median per frame, tracking left out."""
+    """Median time per frame, without tracking."""
     flip: float
     settings: Mapping[str, str]
     images: Mapping[int, Image]
     over_paper: float = math.nan
-    """Median ratio of its frames' times to the paper preset's, paired."""
+    """Median ratio of its frame times to the paired ones of the preset ``paper``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CaseReport:
-    """All that is known of a case."""
+    """Measurements of a case."""
 
     case: Case
     reference: Mapping[int, Image]
-    """Pictures that others are compared with: the truth, or the best there is."""
+    """Reference pictures: the truth, or the most accurate result."""
     rows: tuple[Row, ...]
     pictures: Mapping[tuple[str, str], Image]
-    """The last picture of every method."""
+    """Last picture of every method."""
     wholes: tuple[Whole, ...]
     region: Mask
-    """Pixels of the last picture that anything virtual changes."""
+    """Pixels of the last picture that virtual content changes."""
 
 
 def settings_of(case: Case) -> tuple[Setting, ...]:
-    """Return the settings that change what a case shows or costs."""
+    """Return the settings that change the picture of a case, or its cost."""
     return relevant_settings(case.scene, (case.scene.camera.width, case.scene.camera.height))
 
 
@@ -122,16 +121,16 @@ def measure_case(
     clock: Clock | None = None,
     presets: Sequence[str] = RUNS,
 ) -> CaseReport:
-    """Turn every setting, then run presets and the best choices.
+    """Measure every setting of a case, then presets and the best choices.
 
     Args:
-        case: Frames, and their truth if it is known.
+        case: Frames, with their truth if it is known.
         device: ``cpu`` or ``cuda:N``.
-        settings: Settings to turn.
-        tell: Told of what is done.
-        quick: True to leave brute force out.
-        clock: Seconds of whole frames; None is the time that passes.
-        presets: Presets to run as a whole.
+        settings: Settings to vary.
+        tell: Receives a description of each finished step.
+        quick: Whether to leave out brute force.
+        clock: Clock in seconds for whole frames; None: elapsed time.
+        presets: Presets to measure as a whole.
     """
     rows: list[Row] = []
     pictures: dict[tuple[str, str], Image] = {}
@@ -166,11 +165,11 @@ def measure_case(
 def run(
     case: Case, quality: Quality, device: str, keep: Callable[[Pipeline], object] | None = None
 ) -> dict[int, Image]:
-    """Run a case's frames and return the pictures that are compared; the frames before only bring the light, cheaply.
+    """Light a case's frames and return the compared pictures; other frames use cheap methods that keep the light.
 
     Args:
-        case: Frames, and which pictures are wanted.
-        quality: Quality of the wanted pictures.
+        case: Frames, with the indices of the compared ones.
+        quality: Quality of the compared pictures.
         device: ``cpu`` or ``cuda:N``.
         keep: Called with the pipeline that made the last picture.
     """
@@ -196,11 +195,11 @@ def run(
 def run_in_turn(
     case: Case, qualities: Mapping[str, Quality], device: str, clock: Clock
 ) -> tuple[dict[str, list[float]], dict[str, dict[int, Image]]]:
-    """Run several qualities frame by frame in turn, so that whatever else goes on disturbs all alike.
+    """Light frames with several qualities in turn, so that disturbances affect all alike.
 
     Returns:
-        Milliseconds of every whole frame after the first ``WARM_UP``, until its picture is on the host, tracking left
-        out, and the wanted pictures; by label.
+        Milliseconds of whole frames after the first ``WARM_UP`` (until the picture is on the host, without tracking),
+        and the compared pictures; by label.
     """
     times: dict[str, list[float]] = {label: [] for label in qualities}
     images: dict[str, dict[int, Image]] = {label: {} for label in qualities}
@@ -223,7 +222,7 @@ def run_in_turn(
 def _run_wholes(
     case: Case, qualities: Mapping[str, Quality], reference: Mapping[int, Image], device: str, clock: Clock
 ) -> tuple[Whole, ...]:
-    """Return cost and error of whole pictures by several qualities."""
+    """Return cost and error of whole frames at several qualities."""
     times, images = run_in_turn(case, qualities, device, clock)
     return tuple(
         Whole(
@@ -241,7 +240,7 @@ def _run_wholes(
 
 
 def _equals(costs: Costs, settings: Sequence[Setting]) -> dict[str, Quality]:
-    """Return our choices in the paper's time and at its error, as ``--quality auto`` would make them."""
+    """Return our choices at the paper's time and at its error, chosen as by ``--quality auto``."""
     errors = load_errors()
     front = pareto_front(make_method_costs(costs, errors))
     paper = {setting.name: chosen(PRESETS["paper"], setting) for setting in settings}
@@ -254,15 +253,15 @@ def _equals(costs: Costs, settings: Sequence[Setting]) -> dict[str, Quality]:
 def sweep(
     case: Case, setting: Setting, device: str, costs: Costs, *, base: Quality = BASE, methods: Sequence[str] = ()
 ) -> tuple[list[Row], dict[str, Image]]:
-    """Return a row for every method of one setting, and its last picture.
+    """Measure every method of one setting; return a row and the last picture of each.
 
     Args:
-        case: Frames, and their truth if it is known.
-        setting: Setting to turn.
+        case: Frames, with their truth if it is known.
+        setting: Setting to vary.
         device: ``cpu`` or ``cuda:N``.
         costs: Measured costs of the methods.
-        base: Quality that all other settings stay on.
-        methods: Some of the setting's, in its order; none means all.
+        base: Quality of all other settings.
+        methods: Methods to measure, in the setting's order; empty means all.
     """
     qualities = {
         method: turn(base, {**_FAIR.get(setting.name, {}), setting.name: method})
@@ -286,9 +285,9 @@ def sweep(
 
 
 def is_dominated(row: Row, rows: Sequence[Row]) -> bool:
-    """Return whether another method costs no more and errs no more.
+    """Return True if another method costs no more and has no larger error.
 
-    Measurements that cannot be told apart count as equal; of equals the first method stays.
+    Differences within the measurement noise count as equal; of equal methods the first is not dominated.
     """
 
     def better(a: Row, b: Row) -> bool:
@@ -309,15 +308,15 @@ def picture_error(
     images: Mapping[int, Image],
     last: Mapping[int, Image] | None = None,
 ) -> float:
-    """Return the error of a picture: FLIP summed over it, divided by the pixels that anything virtual changes.
+    """Return the error of pictures: FLIP summed and divided by the number of pixels that virtual content changes.
 
-    It is the mean over the compared frames.
+    The result is the mean over the compared frames.
 
     Args:
-        case: Frames.
-        reference: Pictures that tell which pixels are changed.
-        images: Pictures to judge.
-        last: Pictures to compare them with; None: ``reference``.
+        case: Frames with their regions.
+        reference: Pictures that determine the changed pixels.
+        images: Pictures to evaluate.
+        last: Pictures to compare with; None: ``reference``.
     """
     errors = []
     for index, picture in reference.items():
@@ -328,5 +327,5 @@ def picture_error(
 
 
 def region_of(case: Case, index: int, reference: Image) -> Mask:
-    """Return the pixels of a frame that anything virtual, or the exposure, changes."""
+    """Return the pixels of a frame that virtual content or the exposure changes."""
     return case.regions[index] if index in case.regions else changed_region(case.frames[index].image, reference)

@@ -1,4 +1,4 @@
-"""FLIP [ANAM20]: the difference that an observer sees who flips between two pictures, 0 to 1 per pixel.
+"""FLIP [ANAM20]: the difference seen by an observer who alternates between two pictures, 0 to 1 per pixel.
 
 References:
     [ANAM20] Andersson, Nilsson, Akenine-Moeller, Oskarsson, Astroem, Fairchild, "FLIP: A Difference Evaluator for
@@ -18,23 +18,23 @@ from warp_ar.errors import UsageError
 Array = npt.NDArray[Any]
 
 CHANGED = 0.02
-"""Smallest difference, of full scale, that counts as changed by something virtual."""
+"""Least difference, relative to full scale, that counts as changed by virtual content."""
 BLUR = 3.0
-"""Standard deviation in pixels of the blur before that: noise does not count."""
+"""Standard deviation in pixels of the blur before that test, which suppresses noise."""
 REACH = 9
-"""Side in pixels by which changed regions are widened."""
+"""Width in pixels by which changed regions are dilated."""
 CLIPPED_CODE = 254
 """Code from which a channel counts as clipped."""
 FLIP_REACH = 32
-"""Pixels beyond which a difference changes FLIP nowhere: its filters reach 10, and those of their borders less."""
+"""Distance in pixels within which a difference changes FLIP: its filters reach 10, and those at borders less."""
 
 
 def flip_map(reference: Array, test: Array) -> npt.NDArray[np.float32]:
-    """Return FLIP of every pixel, (height, width), 0..1; it is computed where the pictures differ.
+    """Return FLIP of every pixel, (height, width), 0 to 1; computed only near differences.
 
     Args:
         reference: uint8 RGB (height, width, 3).
-        test: The same shape and type.
+        test: Picture of the same shape and type.
 
     Raises:
         UsageError: The package flip-evaluator is not installed.
@@ -52,9 +52,9 @@ def flip_map(reference: Array, test: Array) -> npt.NDArray[np.float32]:
 
 
 def _evaluate_flip(reference: Array, test: Array) -> npt.NDArray[np.float32]:
-    """FLIP of every pixel by its authors' program."""
+    """Return FLIP of every pixel by its authors' program."""
     try:
-        import flip_evaluator  # only what measures pictures needs it
+        import flip_evaluator  # imported here: only measurements need it
     except ImportError as error:
         raise UsageError('FLIP needs the package flip-evaluator: pip install "warp-ar[tradeoff]"') from error
     pictures = (np.asarray(picture, np.float32) / 255.0 for picture in (reference, test))
@@ -63,7 +63,7 @@ def _evaluate_flip(reference: Array, test: Array) -> npt.NDArray[np.float32]:
 
 
 def changed_region(camera: Array, truth: Array) -> npt.NDArray[np.bool_]:
-    """Pixels in which the truth differs from the camera's frame beyond noise; both uint8 RGB of one shape."""
+    """Return the pixels in which the truth differs from the camera's frame beyond noise; both are uint8 RGB."""
     difference = np.abs(camera.astype(np.float32) - truth.astype(np.float32)).max(-1) / 255.0
     blurred = cv2.GaussianBlur(difference, (0, 0), BLUR)
     widened = cv2.dilate((blurred > CHANGED).astype(np.uint8), np.ones((REACH, REACH), np.uint8))
@@ -71,5 +71,5 @@ def changed_region(camera: Array, truth: Array) -> npt.NDArray[np.bool_]:
 
 
 def clipped_region(camera: Array) -> npt.NDArray[np.bool_]:
-    """Pixels of a uint8 RGB frame in which some channel clips."""
+    """Return the pixels of a uint8 RGB frame in which some channel clips."""
     return np.asarray((camera >= CLIPPED_CODE).any(-1))

@@ -1,9 +1,8 @@
-"""The picture of a frame by path tracing: progressive, with a standard error for every pixel.
+"""Progressive path tracing of a frame, with a standard error for every pixel.
 
-``kernels/reference/path_tracer.py`` and ``path_following.py`` say what it sums. It knows the scene, the light of the
-environment
-and one frame with its pose, as the pipeline does, and approximates nothing else: with enough samples it is what the
-pipeline's methods are to be judged by.
+``kernels/reference/path_tracer.py`` and ``path_following.py`` define the estimated sum. Like the pipeline, the path
+tracer is given the scene, the environment's light, and one frame with its pose. It makes no other approximation, so
+that with enough samples it is the reference for the pipeline's methods.
 """
 
 from __future__ import annotations
@@ -54,52 +53,52 @@ FloatImage = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 
 DEFAULT_SAMPLES = 256
-"""Per pixel, where nothing else is asked for."""
+"""Default number of samples per pixel."""
 LIGHT_SAMPLES = 32
-"""Per pixel, by which the reflectance of proxies is found before the picture."""
+"""Samples per pixel that estimate the reflectance of proxies before the picture."""
 FIRST_LIGHT_SAMPLES = 4
-"""Number of these samples after which each proxy's mean reflectance is known."""
+"""Number of these samples after which each proxy's mean reflectance is estimated."""
 UNKNOWN_REFLECTANCE = 0.5
-"""Reflectance of a proxy that no pixel shows."""
+"""Reflectance of a proxy that is visible in no pixel."""
 DFG_SIZE = 32
 """Rows and columns of the table of directional albedo."""
 PART = 2048
-"""Samples that a thread takes at a time, on CPU."""
+"""Samples that a CPU thread traces at a time."""
 MOST_SAMPLES = 1 << 21
-"""Largest number of samples of a round on a CPU."""
+"""Largest number of samples of a round on CPU."""
 MOST_CUDA_SAMPLES = 1 << 25
 """Largest number of samples of a round on a GPU with ``SAMPLE_BYTES`` of free memory for each."""
 SAMPLE_BYTES = 512
-"""That must be free for each: several times what it takes."""
+"""Free bytes needed for each sample of a round: several times its use."""
 PATHS_OF_LIGHTS = 0.25
-"""Paths from virtual lights per pixel and pass, and from near emitters."""
+"""Paths per pixel and pass from virtual lights, and as many from near emitters."""
 FIRST_ROUND = 16
-"""Samples per pixel after which something is learned from them; and again whenever there are twice as many."""
+"""Samples per pixel after which noise and guiding are updated; again at each doubling."""
 AROUND = 9
-"""Width in pixels of the square whose noise tells a pixel's share."""
+"""Width in pixels of the square over which a pixel's noise is averaged."""
 LEAST_SHARE, MOST_SHARE = 0.25, 32.0
-"""Samples of a pixel over the mean: where none has met rare light yet, it is still looked for."""
+"""Bounds of a pixel's samples relative to the mean; the lower one keeps searching for rare light."""
 LEAST_CHANGE = 1e-4
-"""Radiance, in camera values, by which a pixel differs from the frame at least where something virtual shows in it."""
+"""Least difference from the frame, in camera values, of a pixel that shows something virtual."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TracedPicture:
-    """A picture on its way to the truth."""
+    """Picture of the samples so far, with its error."""
 
     radiance: FloatImage
-    """Linear, in camera values, not clipped, (H, W, 3)."""
+    """Linear radiance in camera values, unclipped, (H, W, 3)."""
     error: FloatImage
     """Standard error of ``radiance``, (H, W, 3)."""
     image: Image
-    """The picture as the camera would have encoded it at the scene's exposure, (H, W, 3) RGB."""
+    """Picture as the camera would have encoded it at the scene's exposure, (H, W, 3) RGB."""
     samples: int
-    """Per pixel, in the mean."""
+    """Mean number of samples per pixel."""
     seconds: float
-    """That sampling took, from the first sample on."""
+    """Seconds of sampling, from the first sample on."""
     relative_error: float
-    """Root mean square of the standard error over that of the radiance, in pixels that virtual objects and lights
-    change; of a pixel that clips, as far as it can be seen."""
+    """RMS of the standard error over RMS of the radiance, in pixels that virtual objects and lights change; errors of
+    clipped pixels count as far as they are visible."""
 
 
 def _relative_error(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> float:
@@ -112,31 +111,32 @@ def _relative_error(picture: FloatImage, error: FloatImage, frame: FloatImage | 
 
 
 def _changed(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> npt.NDArray[np.bool_]:
-    """Pixels that virtual objects and lights change, (H, W)."""
+    """Return a mask of the pixels that virtual objects and lights change, (H, W)."""
     if frame is None:
         return np.ones(picture.shape[:2], bool)
     return np.asarray((np.abs(picture - frame) > LEAST_CHANGE).any(axis=2) | (error > LEAST_CHANGE).any(axis=2))
 
 
 def _seen_noise(picture: FloatImage, error: FloatImage) -> npt.NDArray[np.float64]:
-    """Standard error as far as it can be seen: not in what surely clips, (H, W, 3)."""
+    """Return the visible standard error, which is 0 in pixels that surely clip, (H, W, 3)."""
     return np.where(picture - error > 1.0, 0.0, np.minimum(error, 1.0)).astype(np.float64)
 
 
-# With n_i of N samples in pixel i the variance of the picture is the sum of v_i / n_i, least where n_i grows as the
-# root of v_i, the variance of one sample. It is that of the neighbours' samples: what the pixel's own gave has no say
-# in how many more it gets, for the mean of samples that go on until a bright one came would be biased. Neighbours are
-# those that show the same kind of surface: an object's noise and that of the desk beside it are of different size.
+# With n_i of N samples in pixel i, the variance of the picture is the sum of v_i / n_i, where v_i is the variance of
+# one sample. It is least for n_i in proportion to the square root of v_i. v_i is estimated from the neighbours: if a
+# pixel's own samples decided how many more it gets, its mean would be biased, because sampling would continue until a
+# bright one came. Only neighbours with the same kind of surface are used: the noise of an object and of the desk next
+# to it differ.
 def sample_shares(
     picture: FloatImage, error: FloatImage, samples: npt.NDArray[np.int32], proxies: FloatImage
 ) -> FloatImage:
-    """Samples of each pixel in a pass, 1 in the mean, by the noise of the pixels around it.
+    """Return the samples of each pixel in a pass, with mean 1, by the noise of the surrounding pixels.
 
     Args:
         picture: Linear radiance, (H, W, 3).
-        error: Its standard error, (H, W, 3).
-        samples: Of each pixel so far, (H, W).
-        proxies: Share of these that show a proxy, (H, W).
+        error: Standard error of the radiance, (H, W, 3).
+        samples: Samples of each pixel so far, (H, W).
+        proxies: Share of each pixel's samples that show a proxy, (H, W).
     """
     variance = (_seen_noise(picture, error) ** 2).mean(axis=2) * samples
     deviation = np.zeros(variance.shape)
@@ -157,8 +157,8 @@ def sample_shares(
 class PathTracer:
     """Path-traces one frame of a scene.
 
-    Samples are added with ``sample``; ``picture`` says what they give so far. The same arguments and seed give the same
-    picture to the bit on one device, however many samples are added at a time.
+    ``sample`` adds samples; ``picture`` returns their result so far. On one device the same arguments and seed give a
+    bit-identical picture, in however many steps samples are added.
     """
 
     def __init__(
@@ -175,25 +175,25 @@ class PathTracer:
         reflectances: tuple[tuple[float, float, float], ...] | None = None,
         light_samples: int = LIGHT_SAMPLES,
     ) -> None:
-        """Put everything on the device.
+        """Copy scene, light and frame to the device.
 
         Args:
-            scene: What there is.
-            light: The environment, in the world's axes: latlong radiance (h, 2 h, 3) in camera values, or a captured
-                light, whose emitters of known distance are then where they are.
-            frame: What the camera saw, (H, W, 3): encoded (uint8) or linear (float32). None: nothing is known of the
-                physical surfaces but ``reflectances``, and the picture is that of the whole scene, physical surfaces
-                and environment included.
+            scene: Scene to trace.
+            light: Environment in the world's axes: latlong radiance (h, 2 h, 3) in camera values, or a captured light,
+                whose emitters of known distance are placed there.
+            frame: Camera frame without anything virtual, (H, W, 3): encoded (uint8) or linear (float32). None: physical
+                surfaces have ``reflectances``, and the picture shows the whole scene, including physical surfaces and
+                environment.
             pose: ``camera_from_world``.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            size: Width and height of the picture; None means the camera's. The frame is averaged down to it.
-            seconds: Since the first frame: where what is animated stands.
-            seed: Of the random numbers, 0 or more.
-            reflectances: RGB of each proxy, without a frame; 0.5 where left out.
-            light_samples: Per pixel, by which the reflectance of proxies is found; more than FIRST_LIGHT_SAMPLES.
+            size: Width and height of the picture; None means the camera's. The frame is averaged to this size.
+            seconds: Time since the first frame, for animations.
+            seed: Seed of the random numbers, 0 or more.
+            reflectances: RGB reflectance of each proxy if there is no frame; None: 0.5.
+            light_samples: Samples per pixel that estimate the reflectance of proxies; more than FIRST_LIGHT_SAMPLES.
 
         Raises:
-            UsageError: The frame, the light, the seed or the reflectances do not fit.
+            UsageError: The frame, the light, the seed or the reflectances cannot be used.
             SceneError: The camera cannot be scaled to ``size``.
         """
         if not 0 <= seed < 2**31:
@@ -207,13 +207,13 @@ class PathTracer:
         self.exposure = scale if isinstance(scale, float) else 1.0
         self._seconds = 0.0
         self._followed = 0
-        """Passes of paths from virtual lights that were made."""
+        """Number of passes of paths from virtual lights so far."""
         self._work, self._sliced, self._goal = self._all_work(), False, 0
-        """Work left; True if it is done pass by pass; samples per pixel for which it is done else."""
+        """Remaining work; whether it is done pass by pass; if not, the number of samples per pixel to reach."""
         self._compiled: set[str] = set()
         self._prepared = False
         self._passes = 0
-        """Made with the shares that are there."""
+        """Number of passes with the current shares."""
         self._linear = None if frame is None else _linear_frame(frame, self.camera)
         self._config = trace_variant(trace_config(scene), self.device)
         with translating(self.device), wp.ScopedDevice(self.device):
@@ -227,7 +227,7 @@ class PathTracer:
             self._part = self._most = max(1, min(MOST_CUDA_SAMPLES, self.device.free_memory // SAMPLE_BYTES))
 
     def _allocate(self) -> None:
-        """Moments of no samples, and what a picture of them is written to."""
+        """Allocate the moments, with no samples, and the arrays of the picture."""
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
         self._round = make_round(shape, self.device)
@@ -242,14 +242,14 @@ class PathTracer:
         self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
 
     def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
-        """The scene as paths meet it."""
+        """Return the scene in the form that paths intersect."""
         local = LocalScene()
         device, shape = self.device, (self.camera.height, self.camera.width)
         objects = np.zeros(self._host.shape_count, structs.struct_dtype(structs.Shape))
         lights = np.zeros(len(self.scene.lights), structs.struct_dtype(structs.Light))
         self._host.write_objects(objects, seconds)
         self._host.write_lights(lights, seconds)
-        # Without a frame the first surface's reflectance is a factor of its paths, not of what they sum to.
+        # Without a frame the first surface's reflectance is a factor of each path, not of the sum of paths.
         materials, known = self._host.ray_scene.materials.numpy(), self._linear is not None
         self._follows_lights = known and follows_lights(lights, objects, materials)
         local.rays = self._host.ray_scene
@@ -301,9 +301,9 @@ class PathTracer:
         self._local.proxy_reflectance = wp.array(values, dtype=wp.vec3, device=self.device)
 
     def _trace(self, asked: int, first: int, count: int) -> Iterator[None]:
-        """Make so many passes, in rounds of as many as there is room for, each in parts that cores take side by side.
+        """Trace passes in rounds as large as memory allows, each in parts that run in parallel on the cores.
 
-        ``first`` is the number of a pixel's first sample in the moments.
+        ``first`` is the index of a pixel's first sample in the moments.
         """
 
         def trace(part: tuple[int, int]) -> None:
@@ -326,7 +326,7 @@ class PathTracer:
                     yield from self._follow_lights()
 
     def _follow_lights(self) -> Iterator[None]:
-        """Follow the paths of a pass from virtual lights, in parts as ``_in_parts`` has it."""
+        """Trace the paths of a pass from virtual lights, in parts as ``_in_parts`` makes them."""
         each = self._paths_of_each()
         of_lights = each if self._follows_lights else 0
         count = of_lights + (each if self._follows_emitters else 0)
@@ -339,15 +339,15 @@ class PathTracer:
         self._followed += 1
 
     def _paths_of_each(self) -> int:
-        """Paths of a pass from virtual lights, and as many from near emitters, where either are followed."""
+        """Return the number of paths of a pass from virtual lights, which is also that from near emitters."""
         return math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
 
     def _in_parts(self, kind: str, trace: Callable[[tuple[int, int]], None], count: int) -> Iterator[None]:
-        """Trace ``count`` threads in parts that cores take side by side: all of them, or as many as there are cores."""
+        """Trace ``count`` threads in parts on all cores; if work is done pass by pass, yield after a part per core."""
         parts = [(start, min(start + self._part, count)) for start in range(0, count, self._part)]
         if len(parts) == 1 or (parts and kind not in self._compiled):
             with translating(self.device), wp.ScopedDevice(self.device):
-                trace(parts.pop(0))  # compiles, before threads would each do so
+                trace(parts.pop(0))  # compiles the kernel before several threads need it
             self._compiled.add(kind)
             yield
         at_once = usable_cores() if self._sliced else max(len(parts), 1)
@@ -357,7 +357,7 @@ class PathTracer:
                 yield
 
     def _all_work(self) -> Iterator[bool]:
-        """All work in parts; True after one that ended what adds samples to every pixel."""
+        """Yield after each part of the work; True when the samples of every pixel are complete."""
         asked = path_tracer.WHOLE
         if self._linear is not None:
             asked = path_tracer.DIFFERENCE
@@ -384,13 +384,13 @@ class PathTracer:
             yield True
 
     def prepare(self) -> None:
-        """Find the reflectance of proxies; ``sample`` does it where it was not done."""
+        """Estimate the reflectance of proxies, if it was not done; ``sample`` calls this."""
         self._sliced = False
         while not self._prepared:
             next(self._work)
 
     def _map_reflectance(self) -> None:
-        """Reflectance by the light that the moments hold, which then begin anew."""
+        """Compute reflectance from the light in the moments, and clear the moments."""
         map_reflectance(self._local, self._moments, self._local.reflectance)
         found, shown = self._local.reflectance.numpy(), self._local.shown.numpy()
         means = [
@@ -402,7 +402,7 @@ class PathTracer:
         self._passes = 0
 
     def _share(self) -> None:
-        """Share the samples to come among pixels by the noise so far, at ``FIRST_ROUND``, twice as many, and so on."""
+        """Distribute the next samples among pixels by the noise so far, after ``FIRST_ROUND`` and each doubling."""
         rounds, rest = divmod(self.samples, FIRST_ROUND)
         if rest or not rounds or rounds & (rounds - 1):
             return
@@ -414,14 +414,14 @@ class PathTracer:
         self._passes = 0
 
     def _finish(self) -> None:
-        """Write picture and error of the samples so far."""
+        """Write picture and error from the moments."""
         kinds = int(self._follows_lights) + int(self._follows_emitters)
         followed = self._followed * kinds * self._paths_of_each() / (self.camera.width * self.camera.height)
         given = self._local.matt, self._encode, self._moments, self._image_of_lights, followed, self.exposure
         finish_picture(*given, self._radiance, self._error, self._sampled, self._image)
 
     def sample(self, count: int) -> None:
-        """Add ``count`` samples per pixel: in the mean, from ``FIRST_ROUND`` on more where neighbours are noisy.
+        """Add ``count`` samples per pixel on average; after ``FIRST_ROUND``, more where neighbours are noisy.
 
         Raises:
             UsageError: The count is not positive.
@@ -438,12 +438,12 @@ class PathTracer:
         self._seconds += time.perf_counter() - start
 
     def sample_for(self, seconds: float) -> bool:
-        """Add samples for about so long, in parts of a few rows.
+        """Add samples for about the given time, in parts of a few rows.
 
-        Between two passes over the picture, and after any number of them, it is what ``sample`` gives.
+        After each complete pass the picture equals that of ``sample``.
 
         Returns:
-            Whether a pass over the whole picture has ended.
+            True if a pass over the whole picture was completed.
         """
         start, ended, self._sliced = time.perf_counter(), False, True
         while True:
@@ -459,7 +459,7 @@ class PathTracer:
         """Return the picture of the samples so far.
 
         Raises:
-            UsageError: There are none.
+            UsageError: There are no samples yet.
         """
         if self.samples < 1:
             raise UsageError("no samples yet: call sample() first")
@@ -470,29 +470,29 @@ class PathTracer:
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
 
     def shown(self) -> npt.NDArray[np.int32]:
-        """Index of the proxy that alone the frame shows in every pixel, -1 for none or several surfaces, (H, W)."""
+        """Index of the only proxy that the frame shows in each pixel; -1 for none or several surfaces, (H, W)."""
         self.prepare()
         with exclusive(self.device):
             return np.array(self._local.shown.numpy())
 
     def reflectance(self) -> FloatImage:
-        """Reflectance of the proxy that each pixel shows, as frame and light tell it; 0 elsewhere, (H, W, 3)."""
+        """Reflectance of the proxy in each pixel, estimated from frame and light; 0 elsewhere, (H, W, 3)."""
         self.prepare()
         with exclusive(self.device):
             return np.array(self._local.reflectance.numpy())
 
     def frame(self) -> FloatImage:
-        """The frame, linear and at the picture's size, (H, W, 3).
+        """Linear frame at the picture's size, (H, W, 3).
 
         Raises:
-            UsageError: There is none.
+            UsageError: The tracer has no frame.
         """
         if self._linear is None:
             raise UsageError("this path tracer has no frame")
         return self._linear
 
     def rays(self) -> int:
-        """Rays that were traced for the samples so far."""
+        """Number of rays that were traced so far."""
         with exclusive(self.device):
             rays = self._moments.rays.numpy().astype(np.int64).sum() + self._image_of_lights.rays.numpy().sum()
         return int(rays)
@@ -504,12 +504,12 @@ class PathTracer:
         error: float | None = None,
         step: int = 16,
     ) -> Iterator[TracedPicture]:
-        """Pictures that get better, ``step`` samples at a time.
+        """Yield pictures of increasing quality, one per ``step`` samples.
 
         Args:
-            samples: Per pixel, after which to stop.
-            error: Relative standard error at which to stop before.
-            step: Samples between two pictures.
+            samples: Samples per pixel at which to stop.
+            error: Relative standard error at which to stop earlier; None: no limit.
+            step: Samples per pixel between two pictures.
         """
         while self.samples < samples:
             self.sample(min(step, samples - self.samples))
@@ -527,7 +527,7 @@ def _environment(light: Light | FloatImage) -> FloatImage:
 
 
 def _near_emitters(light: Light | FloatImage) -> npt.NDArray[Any]:
-    """Records of the emitters whose distances are known."""
+    """Return records of the emitters with known distances."""
     near = [e for e in light.emitters if e.distance is not None] if isinstance(light, Light) else []
     records = np.zeros(len(near), structs.struct_dtype(structs.Emitter))
     for record, emitter in zip(records, near, strict=True):
@@ -537,7 +537,7 @@ def _near_emitters(light: Light | FloatImage) -> npt.NDArray[Any]:
 
 
 def _linear_frame(frame: Image | FloatImage, camera: Any) -> FloatImage:
-    """Linear radiance of a frame at the camera's size."""
+    """Return the linear radiance of a frame at the camera's size."""
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype not in (np.uint8, np.float32):
         raise UsageError(f"frame is {frame.dtype} {frame.shape}: expected uint8 or float32 (height, width, 3)")
     linear = frame

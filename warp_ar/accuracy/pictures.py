@@ -1,4 +1,4 @@
-"""Crops of pictures around what is to be seen, error maps, and sheets of both."""
+"""Crops of pictures around changed regions, and error maps."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from warp_ar.accuracy.cases import Image
 Box = tuple[slice, slice]
 """Rows and columns of a crop."""
 CROP_WIDTH = 360
-"""Crops are about this many pixels wide: fewer are shown as they are, more are averaged."""
+"""Approximate width of crops in pixels: smaller regions are shown unscaled, larger ones averaged."""
 CROP_ASPECT = 4.0 / 3.0
 """Width over height of a crop."""
 
 
 def error_colors(errors: npt.NDArray[Any]) -> Image:
-    """FLIP, 0..1, from black over red to yellow; the root of the error, so that small ones show."""
+    """Return colours of FLIP, 0 to 1, from black through red to yellow, by its square root, to show small errors."""
     scaled = (np.sqrt(np.clip(errors, 0.0, 1.0)) * 255.0 + 0.5).astype(np.uint8)
     colors = cv2.applyColorMap(scaled, cv2.COLORMAP_INFERNO)
     return np.ascontiguousarray(colors[..., ::-1], dtype=np.uint8)
 
 
 def bounding_box(region: npt.NDArray[np.bool_], shape: tuple[int, int]) -> Box:
-    """Return the box of a region, widened to the shape of a crop inside the picture; all of it where it is empty."""
+    """Return the box of a region, widened to a crop's aspect inside the picture; the whole picture if it is empty."""
     height, width = shape
     rows, columns = np.nonzero(region)
     if len(rows) == 0:
         return slice(0, height), slice(0, width)
-    # Outliers of a few pixels would make any box the whole picture.
+    # Quantiles, because a few outlying pixels would extend the box to the whole picture.
     top, bottom = np.quantile(rows, [0.01, 0.99])
     left, right = np.quantile(columns, [0.01, 0.99])
     high = max(bottom - top, (right - left) / CROP_ASPECT, 60.0) * 1.15 + 8.0
@@ -44,7 +44,7 @@ def bounding_box(region: npt.NDArray[np.bool_], shape: tuple[int, int]) -> Box:
 
 
 def crop(image: Image, box: Box) -> Image:
-    """Part of a picture: small ones scaled up in whole steps so that pixels stay visible, large ones averaged down."""
+    """Return a crop: small ones enlarged by an integer factor so that pixels stay visible, large ones averaged."""
     part = image[box]
     times = max(1, round(CROP_WIDTH / part.shape[1]))
     if times > 1:

@@ -1,4 +1,4 @@
-"""Measurements of cases, as tables in a terminal, JSON lines and the cost table."""
+"""Reports of measured cases: tables in a terminal, JSON lines and the cost table."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import PRESETS
 
 MIN_COLUMNS = 110
-"""Least width of tables without a terminal, so that none is cut."""
+"""Least width of tables if there is no terminal, so that none is cut off."""
 
 
 def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """Return error and cost of every method, and the methods that another beats in every case.
+    """Return error and cost of every method, and the methods that are dominated in every case.
 
-    ``errors`` is FLIP per changed pixel, mean over the cases in which the setting matters; it depends on the device
-    only by rounding. ``milliseconds`` is the mean likewise, and this device's.
+    ``errors`` is FLIP per changed pixel, averaged over the cases in which the setting matters; on different devices it
+    differs by rounding only. ``milliseconds`` is averaged likewise, for this device.
     """
     tables: dict[str, dict[str, Any]] = {"errors": {}, "milliseconds": {}, "dominated": {}}
     for setting in SETTINGS:
@@ -54,7 +54,7 @@ def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any
 
 
 def make_preset_list(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """Return error and milliseconds of every preset's whole frames, by case."""
+    """Return error and milliseconds of whole frames of every preset, by case."""
     return {"program": PROGRAM, "made": _made(reports, device), "presets": _presets(reports)}
 
 
@@ -71,7 +71,7 @@ def _presets(reports: Sequence[CaseReport]) -> dict[str, dict[str, dict[str, flo
 
 
 def _made(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """Return the circumstances in which a table was made."""
+    """Return the conditions under which a table was made."""
     return {
         "by": f"python -m warp_ar.tradeoff {' '.join(report.case.name for report in reports)}",
         "device": device_name(device),
@@ -83,9 +83,9 @@ def _made(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
 
 @functools.cache
 def commit() -> str:
-    """Return the short hash of the checkout, with a + where it has uncommitted changes; ``unknown`` outside one.
+    """Return the short hash of the checkout, with a + for uncommitted changes; ``unknown`` outside a checkout.
 
-    ``WARP_AR_COMMIT`` says it where the files were taken without their history.
+    ``WARP_AR_COMMIT`` states it for copies without the history.
     """
     if "WARP_AR_COMMIT" in os.environ:
         return os.environ["WARP_AR_COMMIT"]
@@ -98,7 +98,7 @@ def commit() -> str:
 
 
 def device_name(alias: str) -> str:
-    """Return the device as a person would name it; for a CPU with the cores that this process may use."""
+    """Return the name of a device for people; for a CPU with the number of cores that this process may use."""
     device = wp.get_device(alias)
     if not device.is_cpu:
         return str(device.name)
@@ -131,7 +131,7 @@ def print_report(report: CaseReport, console: Console) -> None:
 def print_table(
     console: Console, title: str, head: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1
 ) -> None:
-    """Print a table whose first columns are words."""
+    """Print a table whose first ``left`` columns are words."""
     table = Table(title=title)
     for index, column in enumerate(head):
         table.add_column(column, justify="left" if index < left else "right")
@@ -141,8 +141,8 @@ def print_table(
 
 
 def records(report: CaseReport, device: str) -> Iterator[dict[str, Any]]:
-    """Yield one plain record per method and per whole, ready for JSON lines."""
-    signed = {"program": PROGRAM}  # first, as a file is known by its first key
+    """Yield one record per method and per whole preset, for JSON lines."""
+    signed = {"program": PROGRAM}  # first, because a file is recognised by its first key
     common = {"device": device_name(device), "warp": wp.__version__}
     for row in report.rows:
         yield {**signed, "kind": "method", **dataclasses.asdict(row), **common}

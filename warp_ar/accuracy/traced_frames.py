@@ -1,4 +1,4 @@
-"""Frames of a run by path tracing, in the light that its pipeline finds: ``warp_ar.live --samples N``."""
+"""Path-traced frames of a run, in the light that its pipeline finds: ``warp_ar.live --samples N``."""
 
 from __future__ import annotations
 
@@ -13,30 +13,31 @@ from warp_ar.errors import UsageError
 
 @dataclasses.dataclass
 class TracedFrames:
-    """Replaces pictures of a pipeline's frames by the reference's, in the same light and pose.
+    """Path-traces a pipeline's frames in the same light and pose.
 
-    A frame must be handed over before the pipeline begins with the next one, whose light it would get otherwise.
+    Each frame must be passed before the pipeline begins the next one, because the pipeline holds only the current
+    light.
     """
 
     pipeline: Pipeline
     samples: int
-    """Per pixel, at most."""
+    """Largest number of samples per pixel."""
     error: float | None = None
-    """Relative standard error at which a frame is done before."""
+    """Relative standard error at which a frame is finished earlier."""
     first: float | None = dataclasses.field(default=None, init=False)
-    """Time of the first frame, in seconds: from there on what is animated moves."""
+    """Time of the first frame in seconds, at which animations start."""
 
     def __post_init__(self) -> None:
-        """Complain about what cannot be traced.
+        """Check that the pipeline's frames can be traced.
 
         Raises:
-            UsageError: The pipeline keeps to a budget.
+            UsageError: The pipeline adapts its quality to a budget.
         """
         if not isinstance(self.pipeline, Pipeline):
             raise UsageError("--samples with --quality auto: name a preset, whose light is used")
 
     def __call__(self, frame: Any, result: Any) -> Image:
-        """The picture of a frame; the pipeline's own where the marker is lost or the exposure is not that shown."""
+        """Return the traced picture of a frame; the pipeline's if the marker is lost or the exposure is not shown."""
         self.first = frame.time if self.first is None else self.first
         if result.pose is None or not result.shown:
             return result.image  # type: ignore[no-any-return]

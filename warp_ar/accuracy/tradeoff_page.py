@@ -1,4 +1,4 @@
-"""The page of ``warp_ar.tradeoff``: one file, no script, nothing from outside; pictures and charts are inside."""
+"""HTML page of ``warp_ar.tradeoff``: one file with pictures and charts, without scripts or links to others."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from warp_ar.accuracy.pictures import Box, bounding_box, crop, error_colors
 from warp_ar.signature import COMMENT
 
 QUALITY = 82
-"""WebP's quality of all pictures."""
+"""WebP quality of all pictures."""
 SHOWN = ("paper", SAME_TIME, "medium", "high")
-"""Wholes whose pictures are shown."""
+"""Presets and choices whose pictures are shown."""
 REAL_TIME = 1e3 / 30.0
 """Milliseconds of a frame at 30 frames per second."""
 
@@ -66,7 +66,7 @@ def figure(image: Image, caption: str) -> str:
 
 
 def strip(columns: Mapping[str, Image], reference: Image, box: Box) -> str:
-    """Return crops side by side, and below each its error against ``reference``."""
+    """Return crops side by side, and below each its error relative to ``reference``."""
     parts = [figure(crop(image, box), label) for label, image in columns.items()]
     for label, image in columns.items():
         errors = flip_map(reference, image)
@@ -76,7 +76,7 @@ def strip(columns: Mapping[str, Image], reference: Image, box: Box) -> str:
 
 
 def table(head: Cells, rows: Iterable[tuple[Cells, bool]]) -> str:
-    """Return a table; rows come with whether they are set back, and one of a single cell is a heading."""
+    """Return a table. Each row has a flag whether it is greyed out; a row of a single cell is a heading."""
     top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     body = []
     for cells, out in rows:
@@ -89,7 +89,7 @@ def table(head: Cells, rows: Iterable[tuple[Cells, bool]]) -> str:
 
 
 def split(chart: str, beside: str, words: str) -> str:
-    """Return a chart with a table and a sentence beside it."""
+    """Return a chart with a table and a sentence next to it."""
     words = f"<p class=soft>{html.escape(words)}</p>" if words else ""
     return f'<div class="split"><div class="card">{chart}</div><div class="card">{beside}{words}</div></div>'
 
@@ -142,7 +142,7 @@ def _times(ratio: float) -> str:
 
 
 def whole_words(wholes: Sequence[Whole]) -> str:
-    """Return what others take and err beside the paper's way, as it was measured, in whichever favour."""
+    """Return time and error of our choices relative to the paper's method, in words, whichever is better."""
     by_label = {whole.label: whole for whole in wholes}
     paper = by_label.get("paper")
     if paper is None or paper.flip <= 0.0:
@@ -167,7 +167,7 @@ def _setting_section(report: CaseReport, rows: Sequence[Row]) -> str:
     pictures = {row.method: report.pictures[setting.name, row.method] for row in rows}
     first, *_, last = [report.pictures[setting.name, row.method] for row in (*rows, rows[-1])]
     reference = report.reference[index] if report.case.truth else last
-    # Where the methods differ is what there is to see.
+    # Crop where the methods differ.
     difference = np.abs(first.astype(int) - last.astype(int)).max(-1)
     box = bounding_box(difference > max(4, int(0.3 * difference.max())), difference.shape)
     columns = {**pictures, "truth": reference} if report.case.truth else pictures
@@ -190,7 +190,7 @@ def _setting_section(report: CaseReport, rows: Sequence[Row]) -> str:
 
 
 def _list_section(reports: Sequence[CaseReport]) -> str:
-    """Return every method of every setting over all cases: the cost table itself."""
+    """Return every method of every setting over all cases: the cost table."""
     rows: list[tuple[Cells, bool]] = []
     for setting in SETTINGS:
         measured = [row for report in reports for row in report.rows if row.setting == setting.name]
@@ -218,10 +218,10 @@ def _list_section(reports: Sequence[CaseReport]) -> str:
 
 
 def _introduction(made: Mapping[str, Any], *, by_clock: bool) -> str:
-    """Return the page's head, and how it is read."""
+    """Return the page's head and its explanation."""
     counted = "" if by_clock else " Milliseconds of whole frames are processor time, of all threads."
     ramp = error_colors(np.linspace(0.0, 1.0, 128)[None].repeat(4, 0) ** 2)
-    # The ramp's colours go with the root of the error.
+    # The colour ramp follows the square root of the error.
     marks = "".join(f"<span>{mark * mark:.2g}</span>" for mark in np.linspace(0.1, 0.9, 5))
     return (
         f'<!doctype html>{COMMENT}<html lang="en"><head><meta charset="utf-8">'
@@ -244,7 +244,7 @@ def render(reports: Sequence[CaseReport], made: Mapping[str, Any]) -> str:
 
     Args:
         reports: One per case.
-        made: Circumstances: ``device``, ``warp``, and what ``clock`` counts, ``time`` or ``processor time``.
+        made: Conditions: ``device``, ``warp``, and ``clock``, which is ``time`` or ``processor time``.
     """
     by_clock = made.get("clock", "time") == "time"
     limit = REAL_TIME if by_clock else None

@@ -1,1 +1,1 @@
-"""Many clips, and data sets of them: jobs that name files, workers that light them, a manifest that loses nothing."""
+"""Batch processing of many clips and data sets: jobs, workers and a crash-safe manifest."""

@@ -29,7 +29,7 @@ WORKERS = number(1, 4096, "a number from 1 to 4096", int)
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.farm",
         description="Light many recordings, or make a data set of them, with several workers; resume after any death.",
@@ -62,11 +62,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def command(options: argparse.Namespace) -> int:
-    """Do what the options ask for; what cannot be begun leaves no folder.
+    """Run a subcommand; if a run cannot be begun, no folder is left.
 
     Raises:
         RunError: The run is damaged, or cannot go on.
-        UsageError: ``--workers`` is out of bounds, the job file cannot be used, or there is no run in the folder.
+        UsageError: ``--workers`` is out of range, the job file cannot be used, or the folder has no run.
     """
     if options.command == "plan":
         return plan(options)
@@ -85,11 +85,11 @@ def command(options: argparse.Namespace) -> int:
 
 
 def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], Pool]) -> int:
-    """Work through what is open of a run.
+    """Do the remaining jobs of a run.
 
     Raises:
         RunError: The run is damaged, or cannot go on.
-        UsageError: There is none in the folder, or another version of the program or other files began it.
+        UsageError: The folder has no run, or it was begun by another version of the program or with other files.
     """
     data, version = load_run(folder)
     mine = program_version()
@@ -110,12 +110,12 @@ def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], 
             failed = Driver(jobs, folder, manifest, pool, say).run()
         finally:
             manifest.close()
-            clear_aside(folder)  # what workers that were killed left takes room, and is nobody's
+            clear_aside(folder)  # killed workers leave temporary files, which take up space
     return _tell(folder, failed)
 
 
 def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
-    """Return what makes the workers of a run; here it is found out whether there can be any."""
+    """Return a function that makes the workers of a run; check here that they can be made."""
     if options.ray is None:
         devices = devices_of(options.device, options.workers)
         return lambda context: ProcessPool(context, devices)
@@ -123,7 +123,7 @@ def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
 
 
 def _tell(folder: Path, failed: dict[str, str]) -> int:
-    """Say how a run went; returns the exit code."""
+    """Print the outcome of a run; return the exit code."""
     status = read_status(folder)
     counts = words_of_counts(status["done"])
     print(printable(f"{folder}: {counts or 'nothing'} done, {status['frames']} frames, {status['bytes'] / 1e6:.1f} MB"))
@@ -136,7 +136,7 @@ def _tell(folder: Path, failed: dict[str, str]) -> int:
 
 
 def plan(options: argparse.Namespace) -> int:
-    """Count jobs, try a few, and say what all would take."""
+    """Count jobs, try a few, and print the expected time and size of the run."""
     with importing():
         from warp_ar.farm.plan import tell_plan
 

@@ -1,9 +1,9 @@
-"""The table ``[dataset]`` of a job file, and the scene of each variation, drawn from a seed.
+"""Table ``[dataset]`` of a job file, and the random scene of each variation.
 
-Objects and lights are those of scene files, in which numbers that are drawn stand as spans, ``[lowest, highest]``. A
-variation's random numbers come from (seed, number of the clip, number of the variation) alone: which worker draws it,
-and when, changes nothing. Objects stand on the receiver, clear of each other, of what is modelled of the desk, of the
-mirror balls and of the marker's card, and hide the marker from none of the clip's cameras.
+Objects and lights are described as in scene files; a number to be drawn is given as a span, ``[lowest, highest]``. The
+random numbers of a variation depend only on (seed, index of the clip, index of the variation), not on the worker or on
+the time. Objects stand on the receiver without touching each other, the modelled desk, the mirror balls or the marker's
+card, and occlude the marker in no frame of the clip.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from warp_ar.scene.table import Table
 
 
 class JobsError(UsageError):
-    """A job file cannot be used."""
+    """Error of a job file."""
 
 
 class JobTable(Table):
-    """One table of a job file."""
+    """Table of a job file."""
 
     error = JobsError
 
     def path(self, key: str) -> Path | None:
-        """A file or folder, relative to the job file; whether it is there is not asked."""
+        """Return a file or folder, relative to the job file; it need not exist."""
         if key not in self.data:
             return None
         value = self.text(key)
@@ -51,7 +51,7 @@ class JobTable(Table):
         return Path(self.folder / value).absolute()
 
     def pair(self, key: str, default: tuple[int, int], *, low: int) -> tuple[int, int]:
-        """Two whole numbers, the first no more than the second."""
+        """Return two integers, the first no larger than the second."""
         value = self.data.get(key, list(default))
         whole = isinstance(value, list) and all(isinstance(n, int) and not isinstance(n, bool) for n in value)
         if not whole or len(value) != 2 or not low <= value[0] <= value[1]:
@@ -59,7 +59,7 @@ class JobTable(Table):
         return value[0], value[1]
 
     def span(self, key: str, default: tuple[float, float], *, low: float, high: float) -> tuple[float, float]:
-        """Lowest and highest of a number that is drawn; they are one where it is fixed."""
+        """Return the lowest and highest value of a drawn number; equal if it is fixed."""
         value = self.data.get(key, list(default))
         ends = value if _is_span(value) else [value, value]
         if not all(_is_number(end) and low <= end <= high for end in ends) or ends[0] > ends[1]:
@@ -72,7 +72,7 @@ def _is_number(value: object) -> bool:
 
 
 def _is_span(value: object) -> bool:
-    """Return whether a value is two numbers, or two lists of as many numbers."""
+    """Return True if a value is a pair of numbers, or a pair of lists of equally many numbers."""
     if not isinstance(value, list) or len(value) != 2:
         return False
     low, high = (end if isinstance(end, list) else [end] for end in value)
@@ -81,7 +81,7 @@ def _is_span(value: object) -> bool:
 
 _KEYS = ("variations", "seed", "objects", "lights", "every", "region", "margin", "exposure", "object", "light")
 _OWN_KEYS = ("name", "turn", "rest", "weight")
-"""Keys of an object, or a light, that are none of a scene's."""
+"""Keys of an object or a light in addition to those of a scene."""
 _OBJECT_KEYS = ("shape", "file", "radius", "size", "major_radius", "minor_radius", "scale", "rotate", "material")
 _LIGHT_KEYS = ("kind", "weight", "intensity", "color", *Light.USES["spot"])
 _LIGHT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
@@ -89,7 +89,7 @@ _LIGHT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "spot": {"intensity": 1.0, "target": [0.0, 0.0, 0.0], "inner_angle": 15.0, "outer_angle": 8.0},
 }
 RESTS = ("upright", "any")
-"""Ways in which an object stands: turned about the vertical alone, or any way up; its lowest point touches the desk."""
+"""Orientations of objects: rotated about the vertical only, or in any way; the lowest point touches the desk."""
 MOST = 64
 """Largest number of objects, and of lights, in a picture."""
 Share = Callable[[tuple[int, ...]], Any]
@@ -97,7 +97,7 @@ Share = Callable[[tuple[int, ...]], Any]
 
 
 def draw(value: Any, share: Share) -> Any:
-    """Return a table or a value of one, with a drawn value in place of each span."""
+    """Return a table or value with each span replaced by a drawn value."""
     if isinstance(value, dict):
         return {key: draw(value[key], share) for key in sorted(value)}
     if not _is_span(value):
@@ -108,7 +108,7 @@ def draw(value: Any, share: Share) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One kind of object or light: its table, with spans in it."""
+    """Kind of object or light: its table, which may contain spans."""
 
     label: str
     folder: Path
@@ -116,12 +116,12 @@ class Entry:
     """Name of the table."""
     data: Mapping[str, Any]
     weight: float
-    """Weight with which it is chosen, against the others."""
+    """Relative weight with which it is chosen."""
 
     def table(self, share: Share, kind: type) -> SceneTable:
-        """Return a draw as a table of a scene."""
+        """Return a draw of the table as a table of a scene."""
         data = draw(dict(self.data), share)
-        if "outer_angle" in data:  # beyond the inner one
+        if "outer_angle" in data:  # drawn beyond the inner angle
             data["outer_angle"] = round(data["outer_angle"] + data.get("inner_angle", 0.0), 6)
         return SceneTable(self.label, SceneFiles(self.folder), self.section, data, list(fields_of(kind)))
 
@@ -129,28 +129,28 @@ class Entry:
         """Draw one light.
 
         Raises:
-            SceneError: It is none of a scene.
+            SceneError: The draw is not valid in a scene.
         """
         return read_light(self.table(share, Light))
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectSpec(Entry):
-    """One kind of object; its number in the catalogue, from 1 on, is its label."""
+    """Kind of object; its index in the catalogue, from 1 on, is its label."""
 
     name: str
     turn: tuple[float, float]
-    """Lowest and highest degrees about the vertical."""
+    """Lowest and highest rotation about the vertical, degrees."""
     rest: str
     """One of ``RESTS``."""
 
     def draw(self, share: Share) -> Object:
-        """Draw one object; it stands as ``rotate`` says before it is turned."""
+        """Draw one object, in the orientation of ``rotate`` before its random rotation."""
         return read_object(self.table(share, Object))
 
     @functools.cached_property
     def item(self) -> Object:
-        """An object of this kind: shape, size and scale are those of all."""
+        """Object of this kind; all draws share its shape, size and scale."""
         return self.draw(np.zeros)
 
 
@@ -159,18 +159,18 @@ class Dataset:
     """The values of ``[dataset]``."""
 
     variations: int
-    """Variations of each clip."""
+    """Number of variations of each clip."""
     seed: int
     objects: tuple[int, int]
-    """Least and most objects of a picture."""
+    """Least and largest number of objects in a picture."""
     lights: tuple[int, int]
-    """Least and most virtual lights."""
+    """Least and largest number of virtual lights."""
     every: int
-    """One of so many frames is written."""
+    """Interval of written frames: 1 writes every frame."""
     region: tuple[float, ...] | None
-    """x0, y0, x1, y1 in metres within which objects stand; None: the receiver, up to 0.25 m from the marker."""
+    """Area for objects as x0, y0, x1, y1 in metres; None: the receiver within 0.25 m of the marker."""
     margin: float
-    """Metres between objects, and from what is modelled of the desk."""
+    """Least distance in metres between objects, and between objects and the modelled desk."""
     exposure: tuple[float, float]
     """Lowest and highest scale of the exposure."""
     catalogue: tuple[ObjectSpec, ...]
@@ -178,10 +178,10 @@ class Dataset:
 
 
 def read_dataset(label: str, folder: Path, data: object) -> Dataset:
-    """``[dataset]`` of a job file.
+    """Return the table ``[dataset]`` of a job file.
 
     Raises:
-        JobsError: A key is wrong or missing, or an object or a light makes no scene.
+        JobsError: A key is wrong or missing, or an object or a light is not valid in a scene.
     """
     table = JobTable(label, folder, "dataset", data, _KEYS)
     catalogue = tuple(map(_read_object, _entries(table, "object", (*_OWN_KEYS, *_OBJECT_KEYS))))
@@ -265,31 +265,31 @@ def _entry(table: JobTable, data: Mapping[str, Any]) -> dict[str, Any]:
 Points = npt.NDArray[np.float64]
 
 TRIES = 200
-"""Places that are tried for an object before it is left out."""
+"""Number of trial places for an object before it is left out."""
 CAMERAS = 24
-"""Poses of a clip, evenly spread, from which the marker must be seen."""
+"""Number of poses of a clip, evenly spaced, in which the marker must be visible."""
 CARD = 1.4
-"""Side of the marker's card over the marker's own: objects do not stand on its white."""
+"""Side of the marker's card over that of the marker; objects do not stand on the card's margin."""
 QUIET = 1.1
-"""The same of what must be seen: the white next to the marker."""
+"""Side over that of the marker of the area that must be visible, with white around the marker."""
 REACH = 0.25
-"""Metres from the marker within which objects stand where the job file names no region."""
+"""Distance from the marker in metres within which objects stand if the job file states no region."""
 
 CHUNK = 5000
-"""Variations that are put in order at once: 0.2 s of the driver's time."""
+"""Variations that are sorted at once, in 0.2 s of the driver's time."""
 
 
 class NoPlace(Exception):
-    """Fewer objects than asked for found a place."""
+    """Error if fewer objects than the least number could be placed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """A variation."""
+    """Scene of a variation."""
 
     scene: Scene
     kinds: tuple[int, ...]
-    """Number in the catalogue, from 0 on, of each object of the scene."""
+    """Index in the catalogue, from 0 on, of each object of the scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,29 +297,29 @@ class Receiver:
     """The area on which objects of a clip may stand."""
 
     height: float
-    """z of the receiver in metres."""
+    """Height z of the receiver in metres."""
     region: tuple[float, ...]
-    """x0, y0, x1, y1 in metres."""
+    """Area for objects as x0, y0, x1, y1 in metres."""
     taken: tuple[Points, ...]
-    """Convex outlines on the receiver, (n, 2) each, that nothing may stand on."""
+    """Convex outlines of occupied areas on the receiver, (n, 2) each."""
 
 
 def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, poses: Sequence[Pose]) -> Drawn:
     """Draw the scene of one variation.
 
     Args:
-        base: The clip's scene: camera, marker, receiver; its own objects and lights are left out.
-        dataset: What to draw from.
-        clip: Number of the clip.
-        variation: Number of the variation.
-        poses: Of the clip's cameras.
+        base: Scene of the clip with camera, marker and receiver; its own objects and lights are left out.
+        dataset: Kinds of objects and lights to draw from.
+        clip: Index of the clip.
+        variation: Index of the variation.
+        poses: Camera poses of the clip.
 
     Raises:
         NoPlace: Fewer objects than the least number fit.
     """
     kinds, lights, exposure, random = _draw_kinds(dataset, clip, variation)
     drawn = [dataset.kinds_of_light[kind].draw(random.random) for kind in lights]
-    # In the catalogue's order: scenes of the same kinds then share their kernels and their arrays.
+    # In the catalogue's order, so that scenes with the same kinds share kernels and arrays.
     placed = _place(base, dataset, sorted(kinds), poses, random)
     if len(placed) < dataset.objects[0]:
         raise NoPlace(
@@ -333,7 +333,7 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
 
 
 def _draw_kinds(dataset: Dataset, clip: int, variation: int) -> tuple[list[int], list[int], float, np.random.Generator]:
-    """First draws of a variation: its objects and lights, by their numbers; exposure; a generator for what is next."""
+    """Return a variation's object and light kinds, its exposure, and the generator for further draws."""
     random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([dataset.seed, clip, variation])))
     count = int(random.integers(dataset.objects[0], dataset.objects[1] + 1))
     light_count = int(random.integers(dataset.lights[0], dataset.lights[1] + 1))
@@ -343,15 +343,15 @@ def _draw_kinds(dataset: Dataset, clip: int, variation: int) -> tuple[list[int],
 
 
 def in_kindred_order(dataset: Dataset, clip: int, count: int) -> Iterator[int]:
-    """Numbers of a clip's variations, those of the same kinds of objects and lights one after another.
+    """Yield the indices of a clip's variations, those with the same kinds of objects and lights consecutively.
 
-    These share a pipeline, whose making takes several times as long as a frame. They are looked at ``CHUNK`` at a time,
-    so that a data set of any size begins at once.
+    These share a pipeline, which takes several times as long to build as a frame. ``CHUNK`` variations are sorted at a
+    time, so that a data set of any size begins at once.
 
     Args:
-        dataset: What to draw from.
-        clip: Number of the clip.
-        count: Of its variations.
+        dataset: Kinds of objects and lights to draw from.
+        clip: Index of the clip.
+        count: Number of its variations.
     """
 
     def kinds(variation: int) -> tuple[list[int], list[str]]:
@@ -372,7 +372,7 @@ def _choose(random: np.random.Generator, weights: Sequence[float], count: int) -
 def _place(
     base: Scene, dataset: Dataset, kinds: Sequence[int], poses: Sequence[Pose], random: np.random.Generator
 ) -> list[tuple[int, Object]]:
-    """Objects of these kinds where there is room; the larger kinds do not go first, so that all are treated alike."""
+    """Return objects of these kinds at free places; in random order, so that large kinds have no advantage."""
     receiver = receiver_of(base, dataset)
     seen = [poses[i] for i in np.linspace(0, len(poses) - 1, min(CAMERAS, len(poses))).astype(int)] if poses else []
     marker = [_project(base, pose, _marker_corners(base)) for pose in seen] if base.has_marker else []
@@ -398,7 +398,7 @@ def _place(
 def _try(
     drawn: Object, local: Points, spec: ObjectSpec, receiver: Receiver, random: np.random.Generator
 ) -> tuple[Object, Points]:
-    """An object somewhere in the region, resting on the receiver, and its points in the world."""
+    """Return an object at a random place of the region, resting on the receiver, and its points in the world."""
     x0, y0, x1, y1 = receiver.region
     x, y = x0 + random.random() * (x1 - x0), y0 + random.random() * (y1 - y0)
     rotation = rotation_matrix((0.0, 0.0, random.uniform(*spec.turn))) @ rotation_matrix(drawn.rotate)
@@ -413,12 +413,12 @@ def _try(
 
 
 def local_points(item: Object | Proxy) -> Points:
-    """Return points with the same convex hull as an object before scale, turn and place, (n, 3) in metres."""
+    """Return points with the convex hull of an object before scale, rotation and translation, (n, 3) in metres."""
     return np.asarray(mesh_of(item).vertices, np.float64)
 
 
 def receiver_of(scene: Scene, dataset: Dataset) -> Receiver:
-    """Return the area on which objects may stand: the first level plane that is modelled, or the marker's."""
+    """Return the area for objects: on the first modelled level plane, or on that of the marker."""
     plane = next((p for p in scene.proxies if p.shape == "plane" and _is_level(p)), None)
     height = 0.0 if plane is None else plane.at[2]
     region = dataset.region
@@ -439,7 +439,7 @@ def _is_level(proxy: Proxy) -> bool:
 
 
 def _marker_corners(scene: Scene) -> Points:
-    """Corners of the marker or board with the white next to it, (4, 3)."""
+    """Return the corners of the marker or board including adjacent white, (4, 3)."""
     board = scene.marker.board
     width, height = (scene.marker.size, scene.marker.size) if board is None else board.size
     corners = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
@@ -447,19 +447,19 @@ def _marker_corners(scene: Scene) -> Points:
 
 
 def _hull(points: Points) -> Points:
-    """Convex outline of points of a plane, (n, 2)."""
+    """Return the convex outline of points in a plane, (n, 2)."""
     return np.asarray(cv2.convexHull(np.ascontiguousarray(points, np.float32)).reshape(-1, 2), np.float64)
 
 
 def _inflated(outline: Points, margin: float) -> Points:
-    """Outline that is further out by at least ``margin``: a sum with an octagon around its circle."""
+    """Return an outline grown by at least ``margin``: its Minkowski sum with an octagon around that circle."""
     turn = np.arange(8) * (np.pi / 4)
     octagon = np.stack([np.cos(turn), np.sin(turn)], -1) * (margin / np.cos(np.pi / 8))
     return _hull((outline[:, None, :] + octagon).reshape(-1, 2))
 
 
 def _overlap(a: Points, b: Points) -> bool:
-    """Return whether two convex outlines overlap: no side of either separates them."""
+    """Return True if two convex outlines overlap, that is, if no side of either separates them."""
     for outline, other in ((a, b), (b, a)):
         side = np.roll(outline, -1, 0) - outline
         normal = np.stack([side[:, 1], -side[:, 0]], -1)
@@ -470,7 +470,7 @@ def _overlap(a: Points, b: Points) -> bool:
 
 
 def _project(scene: Scene, pose: Pose, points: Points) -> Points | None:
-    """Pixels of points of the world, (n, 2); None where one is not before the camera."""
+    """Return the pixels of points in the world, (n, 2); None if a point is behind the camera."""
     camera = pose.apply(points)
     if camera[:, 2].min() <= 1e-3:
         return None
@@ -478,7 +478,7 @@ def _project(scene: Scene, pose: Pose, points: Points) -> Points | None:
 
 
 def _is_in_view(scene: Scene, poses: Sequence[Pose], points: Points) -> bool:
-    """Return whether the middle of an object is in the picture of at least half of the cameras."""
+    """Return True if the centre of an object is in the picture for at least half of the poses."""
     if not poses:
         return True
     middle = 0.5 * (points.min(0) + points.max(0))[None]
@@ -488,7 +488,7 @@ def _is_in_view(scene: Scene, poses: Sequence[Pose], points: Points) -> bool:
 
 
 def _hides(scene: Scene, poses: Sequence[Pose], marker: Sequence[Points | None], points: Points) -> bool:
-    """Return whether an object, taken for the box around it, may hide the marker from one of the cameras."""
+    """Return True if the box around an object may occlude the marker in one of the poses."""
     box = corners(np.stack([points.min(0), points.max(0)]))
     for pose, seen in zip(poses, marker, strict=False):
         pixels = _project(scene, pose, box)

@@ -1,6 +1,6 @@
-"""Gives jobs to workers until all are done: the next one, one that is tried again, one that has failed for good.
+"""Assignment of jobs to workers until all are done, with retries and final failures.
 
-The driver holds no frame and no list of jobs: of each clip it knows how many jobs there are and which are open.
+The driver holds neither frames nor a list of jobs, only the number of jobs of each clip and which of them are open.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from warp_ar.farm.manifest import Manifest, RunError, bytes_of, changed_input, r
 from warp_ar.farm.pools import Pool
 
 TRIES = 2
-"""Times that a job may fail."""
+"""Number of failures after which a job has failed for good."""
 LIGHTING = ("segment", "variation")
 """Kinds of jobs that light frames."""
 
 
 class Driver:
-    """Works through a run with a pool of workers."""
+    """Runs the jobs of a run by a pool of workers."""
 
     def __init__(
         self,
@@ -35,28 +35,28 @@ class Driver:
         pool: Pool,
         say: Callable[[str], None],
     ) -> None:
-        """Find out what is open.
+        """Find the open jobs.
 
         Args:
             jobs: The job file.
-            folder: Of the run.
-            manifest: Of the run, open for writing.
+            folder: Folder of the run.
+            manifest: Manifest of the run, open for writing.
             pool: Workers.
-            say: Called with a line for people now and then.
+            say: Receives a line of progress from time to time.
         """
         self._jobs, self._folder, self._manifest, self._pool, self._say = jobs, folder, manifest, pool, say
         self._again: collections.deque[Job] = collections.deque()
         self._open: dict[int, int] = {}
-        """Jobs of a surveyed clip that are neither done nor failed."""
+        """Number of jobs of a surveyed clip that are neither done nor failed."""
         self._spent: set[int] = set()
-        """Clips with a job that failed for good."""
+        """Clips with a job that has failed for good."""
         self._coming = self._list_jobs()
         self._surveyed: collections.deque[Iterator[Job]] = collections.deque()
         self._joins: collections.deque[Job] = collections.deque()
         self._finished_now = 0
 
     def _list_jobs(self) -> Iterator[Job]:
-        """Yield surveys, one clip after another; clips that are surveyed or joined already are opened on the way."""
+        """Yield the surveys of all clips; open the jobs of clips that are surveyed already."""
         for clip in range(len(self._jobs.clips)):
             survey = Job("survey", clip)
             if survey.key(self._jobs) in self._manifest.failed:
@@ -72,10 +72,10 @@ class Driver:
                 yield survey
 
     def _refuse_changed(self, key: str) -> None:
-        """Refuse to go on where a file that a survey has read is another one now.
+        """Check that the files that a survey has read are unchanged.
 
         Raises:
-            UsageError: It is.
+            UsageError: A file has changed.
         """
         if told := changed_input(self._manifest.done[key].get("inputs") or {}):
             raise UsageError(
@@ -83,7 +83,7 @@ class Driver:
             )
 
     def _is_done(self, job: Job) -> bool:
-        """Return whether a job's outputs are there and whole; a manifest that says otherwise is put right."""
+        """Return True if a job's outputs are complete; correct the manifest if it disagrees."""
         key, place = job.key(self._jobs), self._folder / job.place(self._jobs)
         line = self._manifest.done.get(key)
         record = line if job.kind in ("join", "index") else record_at(place, key)
@@ -91,7 +91,7 @@ class Driver:
             if line is not None:
                 return True
             if job.kind != "survey" or isinstance(record.get("length"), int):
-                # Its worker had finished when the driver died: taken over.
+                # The worker had finished when the driver died: its outputs are kept.
                 self._manifest.add("done", key, **{k: v for k, v in record.items() if k != "job"}, adopted=True)
                 return True
         if line is not None:
@@ -101,7 +101,7 @@ class Driver:
         return False
 
     def _open_clip(self, clip: int) -> None:
-        """Take the jobs of a clip that has been surveyed."""
+        """Open the jobs of a surveyed clip."""
         length = int(self._manifest.done[Job("survey", clip).key(self._jobs)]["length"])
         spec = self._jobs.clips[clip]
         if spec.end is not None and spec.end > length:
@@ -122,7 +122,7 @@ class Driver:
                 yield job
 
     def _settle(self, clip: int, *, failed: bool) -> None:
-        """Count one open job less; the last of a recording's lets it be joined."""
+        """Decrease a clip's number of open jobs; after the last one of a recording its segments can be joined."""
         self._open[clip] -= 1
         if failed:
             self._spent.add(clip)
@@ -132,7 +132,7 @@ class Driver:
                 self._joins.append(join)
 
     def _next_job(self) -> Job | None:
-        """Return what to do next; None where nothing could begin now."""
+        """Return the next job; None if no job can begin now."""
         while True:
             for waiting in (self._again, self._joins):
                 if waiting:
@@ -148,11 +148,11 @@ class Driver:
                 return survey
 
     def run(self) -> dict[str, str]:
-        """Work until nothing is left; return the reasons of jobs that failed, by their keys.
+        """Run all jobs; return the reasons of failed jobs, by their keys.
 
         Raises:
             RunError: The run cannot go on: a full disk, workers of another version, workers that do not start.
-            UsageError: A file that was read before is another one now.
+            UsageError: A file has changed since it was read.
         """
         try:
             self._work(self._next_job)
@@ -163,7 +163,7 @@ class Driver:
         return dict(self._manifest.failed)
 
     def _index(self) -> None:
-        """Write what a data set has as a whole, anew if a variation was added."""
+        """Write the common files of a data set, again if variations were added."""
         done = [job for clip in sorted(self._open) for job in self._finished_jobs(clip)]
         if not done or (not self._finished_now and self._is_done(Job("index"))):
             return
@@ -182,7 +182,7 @@ class Driver:
                 yield job
 
     def _work(self, next_job: Callable[[], Job | None], arguments: Any = None) -> None:
-        """Give out jobs and take results until there are none of either."""
+        """Submit jobs and take results until both are exhausted."""
         running: dict[Future[Outcome], tuple[int, Job]] = {}
         idle = collections.deque(range(self._pool.size))
         while True:
@@ -198,7 +198,7 @@ class Driver:
                 idle.append(worker)
 
     def _take(self, job: Job, outcome: Outcome) -> None:
-        """Write down what became of a job."""
+        """Record the outcome of a job."""
         key = job.key(self._jobs)
         if outcome.state == "full":
             raise RunError(

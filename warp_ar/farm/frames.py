@@ -1,4 +1,4 @@
-"""Frames of a part of a recording, at the times that they have in the whole."""
+"""Frames of a part of a recording, with their times in the whole recording."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from warp_ar.sources.sources import open_source
 from warp_ar.sources.video_file import VideoFile
 
 DECODERS = 4
-"""Threads of a decoder."""
+"""Number of a decoder's threads."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,11 +29,11 @@ class FrameIndex:
     """Time stamps of the frames of a recording."""
 
     ticks: npt.NDArray[np.int64]
-    """Time stamp of every frame, (n,), growing."""
+    """Time stamp of every frame, increasing, (n,)."""
     tick: fractions.Fraction
-    """Seconds of a tick."""
+    """Duration of a tick in seconds."""
     seekable: bool
-    """True if the time stamps are those of the file, so that a reader can go to one."""
+    """True if the time stamps are those of the file, so that a reader can seek."""
 
     @property
     def length(self) -> int:
@@ -42,15 +42,15 @@ class FrameIndex:
 
 
 class VideoPart(VideoFile):
-    """Frames ``first`` to ``end`` of a video, each with the number and the time that it has in the whole.
+    """Frames ``first`` to ``end`` of a video, with the indices and times that they have in the whole video.
 
     Args:
         path: The file.
-        index: Of its frames.
-        first: Number of the first frame.
-        end: Number behind the last.
-        fps: Show frame n at n / fps instead of at its own time.
-        gpu: Number of the GPU whose decoding unit is to be used, where it has one for this coding; None: none is.
+        index: Index of its frames.
+        first: Index of the first frame.
+        end: Index after the last frame.
+        fps: Show frame n at n / fps instead of its own time; None: at its own time.
+        gpu: Index of the GPU to decode with, if it supports the codec; None: the processor decodes.
     """
 
     _decoders = DECODERS
@@ -64,7 +64,7 @@ class VideoPart(VideoFile):
         self.length = end - first
 
     def _open(self, **how: Any) -> Any:
-        """As ``VideoFile``'s; what the GPU's unit cannot begin is decoded by the processor, with the same pictures."""
+        """Open as ``VideoFile`` does; if the GPU cannot decode it, the processor does, with the same pictures."""
         if self._gpu is not None:
             unit = HWAccel("cuda", device=str(self._gpu), allow_software_fallback=True)
             with contextlib.suppress(SourceError, NotImplementedError):
@@ -102,11 +102,11 @@ class VideoPart(VideoFile):
         raise SourceError(f"{self._path} ends before frame {number}; its packets promise {self._end}")
 
     def _passes(self) -> Generator[Frame, None, None]:
-        """One pass; frames keep the numbers of the whole."""
+        """Yield the frames of one pass, with their indices in the whole video."""
         yield from self._decode()
 
     def _time_of(self, number: int) -> float:
-        """Seconds of a frame since the first of the whole: by one formula, whichever part it is read in."""
+        """Return the seconds of a frame since the first of the whole video; the formula is the same for every part."""
         ticks = self._index.ticks
         return number / self.fps if self._retimed else float(int(ticks[number] - ticks[0]) * self._index.tick)
 
@@ -121,7 +121,7 @@ class FolderPart(FrameFolder):
         self.length = len(self._paths)
 
     def _passes(self) -> Generator[Frame, None, None]:
-        """One pass; pictures keep the numbers of the whole."""
+        """Yield the pictures of one pass, with their indices in the whole folder."""
         yield from self._decode()
 
     def _decode(self) -> Generator[Frame, None, None]:
@@ -131,14 +131,14 @@ class FolderPart(FrameFolder):
 
 
 def index_frames(path: Path, fps: float | None) -> FrameIndex:
-    """Find out at what times the frames of a recording are; of a video only packets are read, nothing is decoded.
+    """Return the times of a recording's frames; of a video only packets are read, without decoding.
 
     Args:
         path: A video file or a folder of pictures.
-        fps: Frame n is shown at n / fps; None: at its own time.
+        fps: Show frame n at n / fps; None: at its own time.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The recording cannot be read.
     """
     with open_source(path, fps=fps) as source:
         if source.exposures:
@@ -164,7 +164,7 @@ def index_frames(path: Path, fps: float | None) -> FrameIndex:
 def open_part(
     path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
 ) -> RecordedSource:
-    """Frames ``first`` to ``end`` of a recording; arguments as ``VideoPart``."""
+    """Return frames ``first`` to ``end`` of a recording; arguments as for ``VideoPart``."""
     with open_source(path, fps=fps) as source:
         is_video = isinstance(source, VideoFile)
     if is_video:
@@ -173,13 +173,13 @@ def open_part(
 
 
 def mean_rate(ticks: npt.NDArray[np.int64], tick: fractions.Fraction) -> float:
-    """Frames a second of time stamps, ``tick`` seconds each."""
+    """Return the mean frame rate of time stamps whose ticks last ``tick`` seconds."""
     seconds = float(int(ticks[-1] - ticks[0]) * tick)
     return (len(ticks) - 1) / seconds if seconds > 0.0 else DEFAULT_FPS
 
 
 def shown_ticks(index: FrameIndex, fps: float | None) -> tuple[npt.NDArray[np.int64], fractions.Fraction]:
-    """Time stamps of what is written, and seconds of their tick: the recording's own unless a rate is given."""
+    """Return time stamps for written frames, and the seconds of a tick: the recording's own unless ``fps`` is given."""
     if fps is None:
         return index.ticks, index.tick
     rate = fractions.Fraction(fps).limit_denominator(1001)

@@ -1,7 +1,7 @@
-"""A job file and the jobs that it stands for: (clip, segment or variation, scene, seed).
+"""Job files, and their jobs: (clip, segment or variation, scene, seed).
 
-A job names files; frames never leave the worker that decodes them. Jobs are numbered, not listed: those of a clip are
-known when the clip has been surveyed, and 100,000 of them take no memory before they are given out.
+A job names files; frames stay in the worker that decodes them. Jobs are numbered, not listed: the jobs of a clip are
+known after its survey, and 100,000 of them take no memory before they are assigned.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
 SCHEMA = 1
 LIGHTS = ("follow", "fixed", "preroll")
-"""Ways to light a clip whose scene has a mirror ball: by what was captured for each frame, by what was captured at the
-clip's end, or by what each segment finds for itself from some frames before it on."""
+"""Light of a clip whose scene has a mirror ball: as captured for each frame, as captured at the clip's end, or as found
+by each segment from some frames before it on."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 DECODERS = ("cpu", "gpu")
-"""Decoders of recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
+"""Decoders of recordings: the processor, or the GPU's decoder if it has one for their codec."""
 AS_RECORDED = "recorded"
-"""Coding beside ``CODINGS`` that recordings are written in: as deep as they came."""
+"""Coding of written recordings besides ``CODINGS``: the bit depth of the source."""
 _RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding", "digests")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
@@ -45,18 +45,18 @@ class Settings:
     light: str = "follow"
     """One of ``LIGHTS``."""
     segment_frames: int | None = None
-    """Frames of a segment; None: a clip is one."""
+    """Frames of a segment; None: one segment per clip."""
     preroll: int = 48
-    """Frames before a segment from which its light and its track are gathered, with ``light = "preroll"``."""
+    """Frames before a segment that determine its light and track, with ``light = "preroll"``."""
     decode: str = DECODERS[0]
     """One of ``DECODERS``."""
     coding: str = AS_RECORDED
     """Coding of the output: one of ``CODINGS``, or ``AS_RECORDED``."""
     digests: bool = False
-    """True if digests of recordings' pictures are kept, as they were before they were encoded."""
+    """True if digests of recordings' pictures, taken before encoding, are kept."""
 
     def gpu_of(self, device: str) -> int | None:
-        """Number of the GPU that decodes for a worker on a device; None: the processor does."""
+        """Return the index of the GPU that decodes for a worker on a device; None: the processor decodes."""
         return int(device.partition(":")[2] or 0) if self.decode == "gpu" and device.startswith("cuda") else None
 
 
@@ -69,15 +69,15 @@ class Clip:
     scene: str
     """A scene file or a bundled scene's name."""
     source: Path | None = None
-    """A video or a folder of frames instead of the scene's own."""
+    """Video or folder of frames in place of the scene's own."""
     light: Path | None = None
-    """Captured light instead of a mirror ball's."""
+    """Captured light in place of a mirror ball's."""
     calibration: Path | None = None
-    """Calibration file instead of the scene's camera."""
+    """Calibration file in place of the scene's camera."""
     first: int = 0
-    """Number of the first frame that is lit."""
+    """Index of the first lit frame."""
     end: int | None = None
-    """Number behind the last one; None: all."""
+    """Index after the last lit frame; None: all frames."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,28 +91,28 @@ class JobFile:
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One piece of work, which one worker does as a whole."""
+    """Unit of work that one worker does."""
 
     kind: str
-    """``survey`` (frames, poses and light of a clip), ``segment``, ``variation``, ``join`` or ``index``."""
+    """Kind: ``survey`` (frames, poses and light of a clip), ``segment``, ``variation``, ``join`` or ``index``."""
     clip: int = 0
-    """Number of the clip."""
+    """Index of the clip."""
     number: int = 0
-    """Number of the segment or variation in its clip."""
+    """Index of the segment or variation in its clip."""
     first: int = 0
-    """Number of the first frame, for segments and variations."""
+    """Index of the first frame, for segments and variations."""
     end: int = 0
-    """Number behind the last one."""
+    """Index after the last frame."""
 
     def key(self, jobs: JobFile) -> str:
-        """Its name in the manifest."""
+        """Return its name in the manifest."""
         if self.kind == "index":
             return "dataset/index"
         name = jobs.clips[self.clip].name
         return f"{name}/{self.kind}" + (f"-{self.number:06d}" if self.kind in ("segment", "variation") else "")
 
     def place(self, jobs: JobFile) -> Path:
-        """Return the place of its result, relative to the run's folder: a folder, or the last file of several."""
+        """Return the path of its result relative to the run's folder: a folder, or the last file of several."""
         name = jobs.clips[self.clip].name
         match self.kind:
             case "survey":
@@ -132,8 +132,8 @@ def jobs_of_clip(jobs: JobFile, clip: int, length: int) -> int:
 
     Args:
         jobs: The job file.
-        clip: Number of the clip.
-        length: Frames that its source has.
+        clip: Index of the clip.
+        length: Number of frames of its source.
     """
     if jobs.dataset is not None:
         return jobs.dataset.variations
@@ -142,7 +142,7 @@ def jobs_of_clip(jobs: JobFile, clip: int, length: int) -> int:
 
 
 def job_of_clip(jobs: JobFile, clip: int, number: int, length: int) -> Job:
-    """One of a clip's segments or variations; arguments as ``jobs_of_clip``."""
+    """Return one of a clip's segments or variations; arguments as for ``jobs_of_clip``."""
     first, end = lit_range(jobs.clips[clip], length)
     if jobs.dataset is not None:
         return Job("variation", clip, number, first, end)
@@ -152,10 +152,10 @@ def job_of_clip(jobs: JobFile, clip: int, number: int, length: int) -> Job:
 
 
 def lit_range(clip: Clip, length: int) -> tuple[int, int]:
-    """First frame that is lit of a clip of so many frames, and the one behind the last.
+    """Return the range of lit frames of a clip with ``length`` frames: first index, and index after the last.
 
     Raises:
-        JobsError: There are none.
+        JobsError: The range is empty.
     """
     end = length if clip.end is None else min(clip.end, length)
     if clip.first >= end:
@@ -164,10 +164,10 @@ def lit_range(clip: Clip, length: int) -> tuple[int, int]:
 
 
 def read_jobs(path: str | Path) -> dict[str, Any]:
-    """The text of a job file as data, with its patterns resolved to files and its paths in full.
+    """Return a job file as data, with patterns expanded to files and absolute paths.
 
     Raises:
-        JobsError: It cannot be read, or a pattern matches nothing.
+        JobsError: The file cannot be read, or a pattern matches nothing.
     """
     path = Path(path)
     label = str(path)
@@ -183,7 +183,7 @@ def read_jobs(path: str | Path) -> dict[str, Any]:
 
 
 def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[str, Any]]:
-    """One entry for each file that a clip's path matches."""
+    """Return one entry for each file that a clip's path matches."""
     table = JobTable(label, folder, f"clip[{index}]", clip, _CLIP_KEYS)
     pattern = table.text("path", "")
     if not glob.has_magic(pattern) or (folder / pattern).exists():
@@ -197,11 +197,11 @@ def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[s
 
 
 def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
-    """Check what ``read_jobs`` read: every scene is loaded, every file looked for.
+    """Check data from ``read_jobs``; every scene is loaded, and every file must exist.
 
     Args:
-        data: Of the file.
-        label: What messages call it.
+        data: Content of the file.
+        label: Name of the file in messages.
 
     Raises:
         JobsError: A key is wrong or missing.
@@ -232,10 +232,10 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
 
 
 def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None:
-    """Refuse exposures that depend on the frames before, where a job does not see those.
+    """Check that exposures do not depend on earlier frames that a job does not see.
 
     Raises:
-        JobsError: They do.
+        JobsError: An exposure does.
     """
     settings = jobs.settings
     whole = settings.light == "preroll" and settings.segment_frames is None
@@ -262,7 +262,7 @@ def _read_settings(table: JobTable) -> Settings:
 
 
 def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:
-    """One clip; ``names`` holds how often a name was used."""
+    """Return one clip; ``names`` counts the uses of each name."""
     scene = table.text("scene", "desk")
     source, light, calibration = (table.path(key) for key in ("path", "light", "calibration"))
     if source is not None and not (is_file(source) or is_folder(source)):
@@ -295,11 +295,11 @@ def _load_scene(name: str) -> Scene:
 
 
 def scene_of(jobs: JobFile, clip: int) -> Scene:
-    """The scene of a clip, with its camera and its light.
+    """Return the scene of a clip, with its camera and its light.
 
     Raises:
-        SceneError: It cannot be used.
-        JobsError: It names no source that can be read again.
+        SceneError: The scene cannot be used.
+        JobsError: The scene names no source that can be read repeatedly.
     """
     spec = jobs.clips[clip]
     scene = _load_scene(spec.scene)
@@ -319,7 +319,7 @@ def scene_of(jobs: JobFile, clip: int) -> Scene:
 
 
 def source_of(jobs: JobFile, clip: int) -> tuple[Path, float | None]:
-    """File or folder of a clip's frames, and the rate at which they are shown instead of their own, if any."""
+    """Return the file or folder of a clip's frames, and the frame rate that replaces its own, or None."""
     spec, own = jobs.clips[clip], scene_of(jobs, clip).source
     if spec.source is not None:
         return spec.source, None
@@ -329,7 +329,7 @@ def source_of(jobs: JobFile, clip: int) -> tuple[Path, float | None]:
 
 
 def inputs_of(jobs: JobFile, clip: int) -> list[Path]:
-    """Return the files and folders that a clip's pictures rest on: recording, scene, calibration, light, meshes."""
+    """Return the files and folders that determine a clip's pictures: recording, scene, calibration, light, meshes."""
     spec, scene = jobs.clips[clip], scene_of(jobs, clip)
     named: list[Path | None] = [source_of(jobs, clip)[0], Path(spec.scene), spec.calibration]
     named += [None if scene.captured is None else scene.captured.file]
@@ -340,7 +340,7 @@ def inputs_of(jobs: JobFile, clip: int) -> list[Path]:
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """Data that all jobs of a run share."""
+    """Data shared by all jobs of a run."""
 
     jobs: JobFile
     folder: Path
@@ -348,31 +348,31 @@ class Context:
     device: str
     """``cpu`` or ``cuda:N``."""
     worker: int = 0
-    """Number of the worker."""
+    """Index of the worker."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The result of a job."""
+    """Result of a job."""
 
     state: str
-    """``done``, ``failed``, or ``full``: the disk is."""
+    """State: ``done``, ``failed``, or ``full`` for a full disk."""
     values: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Values for the manifest's line."""
+    """Values for the job's line of the manifest."""
     reason: str = ""
-    """The error, on one line."""
+    """Error of a failed job, on one line."""
 
 
 _LIBRARIES = ("warp-lang", "numpy", "opencv-contrib-python-headless", "av")
-"""Libraries whose versions change pictures or their bytes."""
+"""Libraries whose versions affect pictures or their encoded bytes."""
 
 
 @functools.cache
 def program_version() -> str:
-    """Version of the package, a digest of its code, and the libraries' versions, on one line."""
+    """Return the package's version, a digest of its code, and the libraries' versions, on one line."""
     root = Path(warp_ar.__file__).parent
     digest = hashlib.sha256()
-    for folder in (root, root / "kernels"):  # a link, which rglob does not follow
+    for folder in (root, root / "kernels"):  # may be a link, which rglob does not follow
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     parts = [f"warp_ar {_version('warp-ar')} {digest.hexdigest()[:12]}"]

@@ -1,9 +1,9 @@
-"""Labels of every picture of a data set, in the folders and files of BOP, with a COCO file beside them.
+"""Labels of every picture of a data set, in BOP's folders and files, with an additional COCO file.
 
 A variation is a BOP scene: ``rgb``, ``depth``, ``mask`` (whole silhouettes) and ``mask_visib``, ``scene_gt.json``,
-``scene_gt_info.json`` and ``scene_camera.json``; beside them ``normals``, ``scene_light.json`` (the light of each
-frame), ``scene_gt_coco.json`` and ``scene.toml``, which shows the variation with ``python -m warp_ar.live``. Masks,
-depth and normals are those of the pixel's centre.
+``scene_gt_info.json`` and ``scene_camera.json``. Additional files are ``normals``, ``scene_light.json`` (the light of
+each frame), ``scene_gt_coco.json`` and ``scene.toml``, which ``python -m warp_ar.live`` can show. Masks, depth and
+normals are sampled at the pixel's centre.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from warp_ar.scene import Scene
 from warp_ar.signature import encode_png
 
 DEPTH_SCALE = 0.1
-"""Millimetres of a step of a depth map; 0 is nothing that is modelled, and whatever is beyond 6.5 m."""
+"""Millimetres per step of a depth map; 0 means no modelled surface, or a depth above 6.5 m."""
 LAYERS = ("image", "ids", "depth", "normals")
-"""Outputs that labels are made from."""
+"""Outputs from which labels are made."""
 _THREADS = 2
 
 Mask = npt.NDArray[np.bool_]
@@ -46,13 +46,13 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclasses.dataclass(frozen=True)
 class _Pictures:
-    """Pictures of a frame by their names."""
+    """Pictures of a frame by name."""
 
     shape: tuple[int, ...]
     files: dict[str, npt.NDArray[Any]]
 
     def copy(self) -> _Pictures:
-        """Return it as it is: its arrays are nobody else's."""
+        """Return this object itself: nothing else refers to its arrays."""
         return self
 
 
@@ -63,10 +63,10 @@ class LabelWriter(ThreadedSink):
         """Make the folders.
 
         Args:
-            folder: Of the variation; it is there.
-            scene: The variation's, with its camera at the size of the frames.
-            kinds: Number in the catalogue of each object.
-            catalogue: What objects are drawn from.
+            folder: Existing folder of the variation.
+            scene: Scene of the variation; its camera has the frames' size.
+            kinds: Index in the catalogue of each object.
+            catalogue: Kinds from which objects are drawn.
         """
         super().__init__(_THREADS)
         self.description = str(folder)
@@ -80,11 +80,11 @@ class LabelWriter(ThreadedSink):
             (folder / name).mkdir()
 
     def label(self, lit: Lit, key: int | None) -> None:
-        """Take a frame that was just lit.
+        """Add a frame that was just lit.
 
         Args:
-            lit: The frame; no other has been lit by its pipeline since.
-            key: Number of the environment in the clip's survey; None: it is the same in all frames.
+            lit: The frame; its pipeline must not have lit another one since.
+            key: Index of the environment in the clip's survey; None: it is the same in all frames.
 
         Raises:
             SinkError: A file cannot be written.
@@ -129,7 +129,7 @@ class LabelWriter(ThreadedSink):
             store(self._folder / f"{name}.png", encode_png(picture, PNG_OPTIONS if picture.ndim == 3 else ()))
 
     def _trace(self, pipeline: Pipeline) -> npt.NDArray[np.uint64]:
-        """Return the objects behind each pixel, a bit each."""
+        """Return the objects that each pixel's ray meets, one bit per object."""
         arrays = pipeline.arrays
         with exclusive(pipeline.device), wp.ScopedDevice(pipeline.device):
             if self._masks is None:
@@ -138,7 +138,7 @@ class LabelWriter(ThreadedSink):
             return np.array(self._masks.numpy())
 
     def _pose(self, lit: Lit, index: int, kind: int) -> dict[str, Any]:
-        """From the model's millimetres to the camera's."""
+        """Return the pose from the model's to the camera's coordinates, in millimetres, as BOP writes it."""
         assert lit.pose is not None
         rotation, position = self._scene.objects[index].pose_at(lit.frame.time)
         placed = lit.pose.rotation @ rotation
@@ -163,7 +163,7 @@ class LabelWriter(ThreadedSink):
         )
 
     def _note_light(self, lit: Lit, key: int | None) -> None:
-        """The environment as radiance in nine spherical harmonics, and the virtual lights where they are now."""
+        """Record the environment as nine spherical harmonics of radiance, and the frame's virtual lights."""
         if self._light is None or self._light[0] != key:
             environment = lit.pipeline.arrays.get("environment")
             harmonics = None
@@ -208,7 +208,7 @@ class LabelWriter(ThreadedSink):
         )
 
     def finish(self) -> int:
-        """Write the tables; returns the number of frames.
+        """Write the tables; return the number of frames.
 
         Raises:
             SinkError: A file cannot be written.
@@ -225,12 +225,12 @@ class LabelWriter(ThreadedSink):
 
 
 def categories(catalogue: Sequence[ObjectSpec]) -> list[dict[str, Any]]:
-    """Return the categories of labels, as COCO has them."""
+    """Return the categories of labels in COCO's form."""
     return [{"id": index + 1, "name": spec.name, "supercategory": "object"} for index, spec in enumerate(catalogue)]
 
 
 def run_lengths(mask: Mask) -> list[int]:
-    """A mask as COCO's run lengths: columns one after another, first the pixels that are not set."""
+    """Return a mask as COCO's run lengths: column by column, beginning with the unset pixels."""
     flat = mask.T.ravel().view(np.uint8)
     ends = np.flatnonzero(np.diff(flat)) + 1
     counts = np.diff(np.concatenate([[0], ends, [len(flat)]])).tolist()
@@ -238,7 +238,7 @@ def run_lengths(mask: Mask) -> list[int]:
 
 
 def _info(whole: Mask, seen: Mask, measured: Mask) -> dict[str, Any]:
-    """BOP's numbers of one object in one picture; ``whole`` holds what is in the picture, not what is beside it."""
+    """Return BOP's numbers of one object in one picture; ``whole`` contains only its part inside the picture."""
     pixels, visible = int(whole.sum()), int(seen.sum())
     return {
         "bbox_obj": _box(whole),
@@ -251,7 +251,7 @@ def _info(whole: Mask, seen: Mask, measured: Mask) -> dict[str, Any]:
 
 
 def _box(mask: Mask) -> list[int]:
-    """x, y, width, height of what is set, in pixels; -1 where nothing is."""
+    """Return x, y, width and height of a mask's set pixels; -1 for an empty mask."""
     return list(map(int, cv2.boundingRect(mask.view(np.uint8)))) if mask.any() else [-1] * 4
 
 
@@ -260,7 +260,7 @@ def _numbers(values: Any) -> list[float]:
 
 
 _LISTED = 50
-"""Clips that a datasheet names."""
+"""Largest number of clips that a datasheet names."""
 
 
 def write_dataset_files(jobs: JobFile, places: Sequence[Path], folder: Path, run: Path, version: str) -> dict[str, Any]:
@@ -268,13 +268,13 @@ def write_dataset_files(jobs: JobFile, places: Sequence[Path], folder: Path, run
 
     Args:
         jobs: The job file.
-        places: Folders of the finished variations, relative to the run's, in their order.
-        folder: Where to write; it is there, and empty.
-        run: The run's folder.
-        version: Of the program.
+        places: Folders of the finished variations in order, relative to the run's folder.
+        folder: Existing, empty folder to write to.
+        run: Folder of the run.
+        version: Version of the program.
 
     Returns:
-        Pictures and labels of the data set.
+        Numbers of pictures and labels of the data set.
 
     Raises:
         SinkError: A file cannot be written.
@@ -292,8 +292,8 @@ def write_dataset_files(jobs: JobFile, places: Sequence[Path], folder: Path, run
 
 
 def _model(spec: ObjectSpec) -> Any:
-    """Triangles of an object in millimetres, about the origin that its pose moves."""
-    import trimesh  # here: no other job needs it
+    """Return the triangles of an object in millimetres, relative to the origin of its pose."""
+    import trimesh  # imported here: no other job needs it
 
     made = mesh_of(spec.item)
     vertices = 1e3 * spec.item.scale * made.vertices
@@ -301,7 +301,7 @@ def _model(spec: ObjectSpec) -> Any:
 
 
 def _write_models(catalogue: Sequence[ObjectSpec], folder: Path) -> None:
-    """One PLY for each object, and their sizes as BOP has them."""
+    """Write one PLY for each object, and their sizes in BOP's form."""
     folder.mkdir()
     table = {}
     for number, spec in enumerate(catalogue, 1):
@@ -320,7 +320,7 @@ def _write_models(catalogue: Sequence[ObjectSpec], folder: Path) -> None:
 
 
 def _diameter(vertices: Any) -> float:
-    """Largest distance between two points, in millimetres; only extreme points along many directions are compared."""
+    """Return the largest distance of two points in millimetres; only extreme points in many directions are compared."""
     golden = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(2000)
     z = 1.0 - (np.arange(2000) + 0.5) / 1000.0
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(golden), np.sqrt(1 - z * z) * np.sin(golden), z])
@@ -334,7 +334,7 @@ def _variations(places: Sequence[Path], run: Path) -> Iterator[tuple[Path, dict[
 
 
 def _write_coco(dataset: Dataset, places: Sequence[Path], path: Path, run: Path) -> collections.Counter[str]:
-    """Join the COCO files of all variations, one at a time: numbers go on from one to the next."""
+    """Merge the COCO files of all variations, one at a time, with consecutive numbers."""
     counts: collections.Counter[str] = collections.Counter()
     annotations = path.with_suffix(".part")
     with open(path, "w", encoding="utf-8") as images, open(annotations, "w+", encoding="utf-8") as labels:
@@ -406,7 +406,7 @@ and by virtual lights. Labels come from the geometry that was rendered; nobody d
 def _datasheet(
     jobs: JobFile, dataset: Dataset, places: Sequence[Path], counts: collections.Counter[str], version: str
 ) -> str:
-    """Return the datasheet: contents, making and limits of the data set."""
+    """Return the datasheet: contents, production and limits of the data set."""
     rows = (
         f"| {number} | {spec.name} | {spec.item.shape} | {counts[f'category {number}']} |"
         for number, spec in enumerate(dataset.catalogue, 1)

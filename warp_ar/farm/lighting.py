@@ -1,4 +1,4 @@
-"""Lighting of the frames of a job: pipelines that are kept between jobs, and their inputs."""
+"""Lighting of a job's frames, with pipelines that are kept between jobs."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from warp_ar.sources.source import Frame, RecordedSource
 from warp_ar.tracking.tracking import given_pose
 
 PIPELINES = 4
-"""Pipelines that are kept for scenes of other objects: each holds its arrays."""
+"""Number of pipelines that are kept for scenes with different objects; each holds its arrays."""
 
 Image = npt.NDArray[np.uint8]
 
 
 @dataclasses.dataclass(frozen=True)
 class Lit:
-    """A frame and what became of it."""
+    """A frame with its pose and its result."""
 
     frame: Frame
     pose: Pose | None
-    """Pose that a survey found; None where the marker was lost, or the frames themselves tell."""
+    """Pose from the survey; None if the marker was lost, or if the pipeline finds the pose."""
     result: Result | None
-    """None where the marker was lost: the picture passes as it came."""
+    """Result of the pipeline; None if the marker was lost, so that the frame stays unlit."""
     pipeline: Pipeline
 
     @property
@@ -49,7 +49,7 @@ class Lit:
 
     @property
     def radiance(self) -> npt.NDArray[np.float32]:
-        """The picture as linear radiance, float32 RGB (height, width, 3); where ``light`` was asked for it."""
+        """Picture as linear radiance, float32 RGB (height, width, 3), if ``light`` was called with that output."""
         if self.result is not None:
             return self.result.radiance
         plate = self.frame.plate
@@ -58,14 +58,14 @@ class Lit:
 
 
 class Lighter(Closing):
-    """Lights segments and variations; one for each worker."""
+    """Lights segments and variations; each worker has one."""
 
     def __init__(self, jobs: JobFile, folder: Path, device: str) -> None:
-        """Light nothing yet.
+        """Take the job file without opening a pipeline.
 
         Args:
             jobs: The job file.
-            folder: Of the run.
+            folder: Folder of the run.
             device: ``cpu`` or ``cuda:N``.
         """
         self._jobs, self._folder, self._device = jobs, folder, device
@@ -73,7 +73,7 @@ class Lighter(Closing):
         self._survey: tuple[int, Survey] | None = None
 
     def close(self) -> None:
-        """Let the pipelines' threads go."""
+        """End the pipelines' threads."""
         for pipeline in self._pipelines.values():
             pipeline.close()
         self._pipelines.clear()
@@ -87,13 +87,13 @@ class Lighter(Closing):
     def light(
         self, job: Job, scene: Scene | None = None, *, outputs: tuple[str, ...] = ("image",), every: int = 1
     ) -> Iterator[Lit]:
-        """Light the frames of a job; of pictures alone the next is begun before one is handed out.
+        """Yield the lit frames of a job; if only pictures are requested, the next frame is begun before one is yielded.
 
         Args:
             job: A segment or a variation.
             scene: Scene to show; None: the clip's own.
             outputs: Outputs of the pipeline.
-            every: One of so many frames is lit.
+            every: Interval of lit frames; 1 lights every frame.
 
         Raises:
             WarpArError: The recording or the scene cannot be used.
@@ -112,7 +112,7 @@ class Lighter(Closing):
             yield before
 
     def _light_surveyed(self, job: Job, scene: Scene | None, outputs: tuple[str, ...], every: int) -> Iterator[Lit]:
-        """Light frames by what their clip's survey found, each as soon as it is handed over."""
+        """Light frames with poses and light of their clip's survey, each when it is requested."""
         survey = self.survey(job.clip)
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
         with contextlib.closing(self._open(job, job.first)) as source:
@@ -133,7 +133,7 @@ class Lighter(Closing):
                 yield Lit(frame, pose, result, pipeline)
 
     def _light_alone(self, job: Job, scene: Scene | None, outputs: tuple[str, ...], every: int) -> Iterator[Lit]:
-        """Light a segment that gathers its own light and track from the frames before it on."""
+        """Light a segment that finds its own light and track, from the frames before it on."""
         own = scene_of(self._jobs, job.clip) if scene is None else scene
         first, _ = lit_range(self._jobs.clips[job.clip], self.survey(job.clip).index.length)
         with (
@@ -154,25 +154,25 @@ class Lighter(Closing):
                     yield Lit(frame, None, result, pipeline)
 
     def _open(self, job: Job, first: int) -> RecordedSource:
-        """Frames of a job's clip up to the job's end."""
+        """Return the frames of a job's clip from ``first`` to the job's end."""
         path, fps = source_of(self._jobs, job.clip)
         gpu = self._jobs.settings.gpu_of(self._device)
         return open_part(path, self.survey(job.clip).index, first, job.end, fps, gpu)
 
     def _options(self) -> dict[str, Any]:
-        """Return the arguments shared by all pipelines."""
+        """Return the arguments that all pipelines share."""
         return {"device": self._device, "quality": self._jobs.settings.quality, "estimates": "synchronous"}
 
     def _pipeline_for(
         self, scene: Scene, source: RecordedSource, outputs: tuple[str, ...], *, follows: bool
     ) -> Pipeline:
-        """A pipeline for a scene, one that is there where only numbers differ.
+        """Return a pipeline for a scene; an existing one if only numbers differ.
 
         Args:
             scene: Scene to show.
-            source: Of the frames.
-            outputs: Of the pipeline.
-            follows: Whether it is lit by what a survey found.
+            source: Source of the frames.
+            outputs: Outputs of the pipeline.
+            follows: Whether poses and light come from a survey.
         """
         size, linear = source.size, keep_depth(source, scene)
         key = skeleton(scene), size, outputs, follows, linear
@@ -185,10 +185,10 @@ class Lighter(Closing):
         self._pipelines[key] = pipeline
         while len(self._pipelines) > PIPELINES:
             self._pipelines.popitem(last=False)[1].close()
-            gc.collect()  # its arrays are part of cycles, and large
+            gc.collect()  # large arrays are part of reference cycles
         return pipeline
 
 
 def _call(pipeline: Pipeline) -> Any:
-    """Return what lights a frame: where pictures alone are wanted, without waiting for it."""
+    """Return the function that lights a frame: ``submit`` if only pictures are requested, else a call."""
     return pipeline.submit if pipeline.plan.request.outputs == ("image",) else pipeline

@@ -1,11 +1,11 @@
-"""The record of a run, kept so that nothing is lost and nothing done twice.
+"""Persistent record of a run, so that after a crash nothing is lost or repeated.
 
-``manifest.jsonl`` has one line for each job that is done or has failed for good, and one for each try that failed. A
-line is appended by one write and synchronised; a line that a crash cut off is cut away when the file is opened again.
-A job's outputs are written aside, and moved to their place by one rename when they are whole, with a ``record.json``
-that says of what job they are: outputs without a line are taken over, a line without outputs is forgotten.
+``manifest.jsonl`` has a line for each job that is done or has failed for good, and for each failed attempt. A line is
+appended by one write and synchronised; an incomplete line after a crash is removed when the file is opened. A job
+writes its outputs to a temporary folder and renames it when they are complete. They include a ``record.json`` that
+names the job: outputs without a line are added to the manifest, and a line without outputs is ignored.
 
-Only one driver at a time has a run: it holds a lock on the folder, which its death frees.
+Only one driver at a time works on a run: it locks the folder, and the lock ends with its process.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ from warp_ar.files import kind_of, parse_json, read_bytes, take_name, write_whol
 
 MANIFEST, RUN, LOCK, RECORD = "manifest.jsonl", "run.json", "lock", "record.json"
 ASIDE = ".aside"
-"""Folder of outputs that are not whole yet."""
+"""Folder of incomplete outputs."""
 _NUMBERS = ("frames", "bytes", "length", "jobs", "seconds", "ended", "worker")
-"""Numbers of a line that says that a job is done."""
+"""Numeric values of the line of a finished job."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 LOCK_SECONDS = 1.0
-"""Within which a lock must come free: who asks for a run's state may hold it for a moment."""
+"""Seconds within which a lock must become free; a status request may hold it briefly."""
 
 
 class RunError(WarpArError):
-    """A run cannot go on."""
+    """Error after which a run cannot go on."""
 
 
 class Manifest:
-    """The lines of a run, and what they say."""
+    """Lines of a run's manifest and the state that they give."""
 
     def __init__(self, folder: Path, *, write: bool) -> None:
-        """Read what is there.
+        """Read the existing lines.
 
         Args:
-            folder: Of the run.
-            write: Whether lines will be added; else a line that is being written is left alone.
+            folder: Folder of the run.
+            write: Whether lines will be added; otherwise an incomplete last line is left unchanged.
 
         Raises:
-            RunError: It cannot be read, or a line in its middle is damaged.
+            RunError: The manifest cannot be read, or a line before the last is damaged.
         """
         self.path = folder / MANIFEST
         self.done: dict[str, dict[str, Any]] = {}
-        """Records of jobs that are done, by their keys."""
+        """Records of finished jobs, by their keys."""
         self.failed: dict[str, str] = {}
-        """Reasons of jobs that failed for good."""
+        """Reasons of jobs that have failed for good."""
         self.tries: dict[str, int] = {}
-        """Tries that failed of jobs that are neither."""
+        """Number of failed attempts of jobs that are neither done nor failed."""
         self._file = -1
         data = _kept(self.path) or b""
         whole = data[: data.rfind(b"\n") + 1]
@@ -101,10 +101,10 @@ class Manifest:
                 self.done.pop(key, None)
 
     def add(self, state: str, key: str, **values: Any) -> None:
-        """Append a line: ``done``, ``failed``, ``try``, or ``again`` for a job whose outputs have gone.
+        """Append a line with the state ``done``, ``failed``, ``try``, or ``again`` for a job whose outputs are missing.
 
         Raises:
-            RunError: It cannot be written; the file is as it was.
+            RunError: The line cannot be written; the file is unchanged.
         """
         line = {"state": state, "job": key, **values}
         data = (json.dumps(line) + "\n").encode()
@@ -121,17 +121,17 @@ class Manifest:
         self._take(line)
 
     def close(self) -> None:
-        """Let the file go."""
+        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
 
 
 def parse_line(line: bytes) -> dict[str, Any]:
-    """A line of a manifest.
+    """Return a line of a manifest as data.
 
     Raises:
-        ValueError: It is none.
+        ValueError: It is no valid line.
     """
     try:
         told = json.loads(line)
@@ -150,10 +150,10 @@ def parse_line(line: bytes) -> dict[str, Any]:
 
 
 def _kept(path: Path) -> bytes | None:
-    """A file that a run keeps of itself; None where there is none.
+    """Return the content of one of a run's own files; None if it does not exist.
 
     Raises:
-        RunError: It is no regular file, too large, or cannot be read.
+        RunError: It is no regular file, is too large, or cannot be read.
     """
     try:
         return None if kind_of(path) == "nothing" else read_bytes(path, "run_bytes", RunError)
@@ -162,7 +162,7 @@ def _kept(path: Path) -> bytes | None:
 
 
 def read_kept(path: Path) -> dict[str, Any] | None:
-    """Return a JSON object that a run keeps; None where there is none, or it is damaged."""
+    """Return the JSON object in one of a run's own files; None if it does not exist or is damaged."""
     with contextlib.suppress(RunError, ValueError):
         told = parse_json((_kept(path) or b"").decode(), str(path), RunError)
         return told if isinstance(told, dict) else None
@@ -171,10 +171,10 @@ def read_kept(path: Path) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Have a run for oneself.
+    """Context that holds the lock of a run.
 
     Raises:
-        RunError: Another driver has it.
+        RunError: Another driver holds it.
     """
     lock = filelock.FileLock(folder / LOCK, timeout=LOCK_SECONDS, mode=0o666)
     try:
@@ -192,7 +192,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def is_locked(folder: Path) -> bool:
-    """Return whether a driver has a run; False where the folder does not tell."""
+    """Return True if a driver works on a run; False if the folder cannot be examined."""
     try:
         if (folder / LOCK).exists():
             filelock.FileLock(folder / LOCK, timeout=0, mode=0o666).acquire().lock.release()
@@ -204,11 +204,11 @@ def is_locked(folder: Path) -> bool:
 
 
 def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
-    """Make a run's folder and write what it is to do.
+    """Make a run's folder, and write its jobs and the version.
 
     Raises:
-        UsageError: The folder holds something else.
-        RunError: It cannot be written.
+        UsageError: The folder is not empty.
+        RunError: The folder cannot be written.
     """
     try:
         if (kind := kind_of(folder)) not in ("folder", "nothing"):
@@ -226,11 +226,11 @@ def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
 
 
 def load_run(folder: Path) -> tuple[dict[str, Any], str]:
-    """Return the jobs of a run, and the version that began it.
+    """Return the jobs of a run, and the version of the program that began it.
 
     Raises:
-        UsageError: There is no run in the folder.
-        RunError: It is damaged.
+        UsageError: The folder has no run.
+        RunError: The run is damaged.
     """
     path = folder / RUN
     kept = _kept(path)
@@ -249,13 +249,13 @@ def load_run(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def clear_aside(folder: Path) -> None:
-    """Remove what workers that died left."""
+    """Remove incomplete outputs of workers that died."""
     shutil.rmtree(folder / ASIDE, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def aside(folder: Path, token: str) -> Iterator[Path]:
-    """Yield an empty folder for outputs that are not whole yet; it is gone afterwards, wherever they were moved to."""
+    """Yield an empty folder for incomplete outputs; on exit it is removed if it was not renamed."""
     path = folder / ASIDE / f"{token}.{secrets.token_hex(4)}"
     path.mkdir(parents=True)
     try:
@@ -265,21 +265,21 @@ def aside(folder: Path, token: str) -> Iterator[Path]:
 
 
 def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Move a folder of outputs to its place; if another worker was first, its outputs stay, for they are the same.
+    """Move a folder of outputs to its place; if another worker's outputs are there, they stay, because they are equal.
 
     Args:
-        part: The folder, on the same disk.
-        place: Where it goes.
-        key: Of the job.
-        values: What else its line of the manifest says, for a driver that comes after one that could not write it.
+        part: Folder of outputs, on the same disk.
+        place: Final path.
+        key: Key of the job.
+        values: Further values of the job's line, for a later driver if this one cannot write the line.
 
     Returns:
-        These, bytes, and a digest over names and contents.
+        The values, with the size in bytes, and a digest of names and contents.
     """
     size, digest = 0, hashlib.sha256()
     for path in sorted(path for path in part.rglob("*") if path.is_file()):
         digest.update(path.relative_to(part).as_posix().encode() + b"\0")
-        with open(path, "r+b") as stream:  # Windows synchronises only what may be written
+        with open(path, "r+b") as stream:  # Windows synchronises only writable files
             digest.update(hashlib.file_digest(stream, "sha256").digest())
             os.fsync(stream.fileno())
         size += path.stat().st_size
@@ -296,7 +296,7 @@ def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None 
 
 
 def publish_file(part: Path, place: Path) -> None:
-    """Move one file to its place, which it takes from a file that stood there."""
+    """Move one file to its place, replacing an existing file."""
     with open(part, "r+b") as stream:
         os.fsync(stream.fileno())
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -314,13 +314,13 @@ def _sync_folder(path: Path) -> None:
 
 
 def record_at(place: Path, key: str) -> dict[str, Any] | None:
-    """Return the record that lies with outputs of a job; None where there is none."""
+    """Return the record in the outputs of a job; None if there is none."""
     told = read_kept(place / RECORD)
     return told if told is not None and told.get("job") == key else None
 
 
 def bytes_of(place: Path) -> int | None:
-    """Return the bytes of a file, or of all files of a folder but its record; None where there is neither."""
+    """Return the size of a file, or of all files in a folder except its record; None if neither exists."""
     try:
         if not place.is_dir():
             return place.stat().st_size
@@ -330,7 +330,7 @@ def bytes_of(place: Path) -> int | None:
 
 
 def describe_inputs(paths: Iterable[Path]) -> dict[str, list[Any]]:
-    """Return size, time of change in nanoseconds and SHA-256 of files, and of the files of folders, by their paths."""
+    """Return size, modification time in nanoseconds and SHA-256 of files, and of files in folders, by their paths."""
     files = [file for path in paths for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
     return {str(file): [*_stamp(file), _digest(file)] for file in files if file.is_file()}
 
@@ -338,7 +338,7 @@ def describe_inputs(paths: Iterable[Path]) -> dict[str, list[Any]]:
 def changed_input(inputs: Mapping[str, Sequence[Any]]) -> str | None:
     """Return a message that names a changed file of ``describe_inputs``; None if all are unchanged.
 
-    A file is read only where its time of change is another.
+    A file is read only if its modification time differs.
     """
     for name, (size, changed, digest) in inputs.items():
         try:
@@ -361,15 +361,15 @@ def _digest(path: Path) -> str:
 
 
 PACE = 50
-"""Number of latest jobs that estimate the remaining time."""
+"""Number of the latest jobs that determine the remaining time."""
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """Return jobs that are done, that have failed, and that are open.
+    """Return the finished, failed and open jobs of a run.
 
     Raises:
-        UsageError: There is no run.
-        RunError: It cannot be read.
+        UsageError: The folder has no run.
+        RunError: The run cannot be read.
     """
     data, version = load_run(folder)
     manifest = Manifest(folder, write=False)
@@ -403,7 +403,7 @@ def _kind(key: str) -> str:
 
 
 def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
-    """The same in words."""
+    """Return the result of ``read_status`` in words, one string per line."""
     lines = [
         f"{folder}: {status['clips']} clips; done: {words_of_counts(status['done']) or 'nothing yet'}",
         f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed",
@@ -423,12 +423,12 @@ def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
 
 
 def words_of_counts(kinds: Mapping[str, int]) -> str:
-    """Jobs of each kind."""
+    """Return the number of jobs of each kind in words."""
     return ", ".join(counted(count, kind) for kind, count in sorted(kinds.items()))
 
 
 def words_of_seconds(seconds: float) -> str:
-    """A duration."""
+    """Return a duration in words."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -1,4 +1,4 @@
-"""The time and the bytes that a run would take: jobs counted, and three of them tried on a few frames."""
+"""Expected time and size of a run: jobs are counted, and three are tried on a few frames."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from warp_ar.farm.pools import cores_of, keeping_to
 from warp_ar.farm.work import Work
 
 PROBES = 3
-"""Clips of which a job is tried."""
+"""Number of clips of which a job is tried."""
 FRAMES = 16
-"""Frames of each."""
+"""Number of frames of each trial."""
 
 
 def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Count jobs and try a few, by the device of the first worker.
+    """Count jobs and try a few, on the first worker's device.
 
     Args:
         jobs: The job file.
-        devices: Of each worker that there will be.
+        devices: Device of each planned worker.
 
     Returns:
-        Jobs, times and bytes in words, and why clips cannot be read.
+        Numbers of jobs, times and sizes in words; and reasons why clips cannot be read.
 
     Raises:
         RunError: No job can be tried.
@@ -55,7 +55,7 @@ def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[st
     if not lengths:
         raise RunError(f"no clip can be tried: {problems[0] if problems else 'there is none'}")
     cores = cores_of(devices)
-    with keeping_to(cores[0]):  # as a worker has them
+    with keeping_to(cores[0]):  # as a worker does
         tried = [_try(jobs, clip, lengths[clip], devices[0]) for clip in list(lengths)[:: -(-len(lengths) // PROBES)]]
     survey_ms, frame_ms, size, kept = (statistics.fmean(values) for values in zip(*tried, strict=True))
     kind = "segments" if jobs.dataset is None else "variations"
@@ -64,7 +64,7 @@ def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[st
         f"a frame: {frame_ms:.1f} ms lit and written, {survey_ms:.1f} ms surveyed, at quality {jobs.settings.quality} "
         f"on {devices[0]}",
     ]
-    # Workers that share a core are no faster than one that has it; a clip is surveyed by one.
+    # Workers that share a core are together no faster than one that has it; a clip is surveyed by one worker.
     at_once = len({core for own in cores for core in own} or devices) if devices[0] == "cpu" else len(devices)
     for workers in sorted({1, len(devices)}):
         busy = min(workers, at_once)
@@ -75,10 +75,10 @@ def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[st
 
 
 def _try(jobs: JobFile, clip: int, length: int, device: str) -> tuple[float, float, float, float]:
-    """Do the first job of a clip on a few frames, twice: the second time all is compiled and read.
+    """Do the first job of a clip on a few frames, twice: the second time everything is compiled and cached.
 
     Returns:
-        Milliseconds of a surveyed frame and of a lit one; bytes of a lit frame and of a surveyed one.
+        Milliseconds per surveyed and per lit frame; bytes per lit and per surveyed frame.
     """
     first, end = lit_range(jobs.clips[clip], length)
     few = dataclasses.replace(jobs.clips[clip], end=min(end, first + FRAMES))

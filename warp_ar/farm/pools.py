@@ -1,8 +1,8 @@
-"""Workers of a run: processes of this machine, each with its own cores, or actors of a Ray cluster.
+"""Workers of a run: processes of this machine, each on its own cores, or actors of a Ray cluster.
 
-A worker takes jobs and gives back records; frames never pass through a pool. One executor of one process stands for
-each worker, so that the death of one loses the job of that one alone. BLAS and OpenCV have one thread each, so that
-results do not depend on how many workers there are.
+A worker receives jobs and returns records; frames never pass through a pool. Each worker has its own executor of one
+process, so that its death only loses its own job. BLAS and OpenCV use one thread each, so that results do not depend on
+the number of workers.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from warp_ar.farm.jobs import Context, Job, Outcome, program_version
 from warp_ar.farm.manifest import RunError
 
 CORES = 4
-"""Processor cores of a worker on CPU; stages of few rows cannot use more."""
+"""Processor cores of a worker on CPU; stages with few rows cannot use more."""
 GPU_CORES = 2
 """Processor cores of a worker on a GPU, for decoding and encoding."""
 MOST_OF_GPU = 16
-"""Workers that share a GPU unless more are asked for: each holds its arrays there."""
+"""Default number of workers on a GPU; each holds its arrays there."""
 DEATHS = 5
-"""Deaths of its workers after which a job has failed."""
+"""Number of times that a job's worker may die before the job has failed."""
 STARTS = 3
-"""Times in a row that a worker may die before it is ready."""
+"""Number of times in a row that a worker may die before it is ready."""
 CONNECT_SECONDS = 30.0
-"""Within which a cluster must answer."""
+"""Seconds within which a cluster must answer."""
 KNOCK_SECONDS = 5.0
-"""Within which a cluster's host must accept a connection."""
+"""Seconds within which a cluster's host must accept a connection."""
 
 
 def devices_of(device: str, workers: int | None) -> list[str]:
-    """Return the device of each worker, one GPU after another.
+    """Return the device of each worker, with GPUs in turn.
 
     Args:
         device: ``auto``, ``cpu`` or ``cuda``.
-        workers: Their number; None: one per four cores, on GPUs one per two, and at least one for each GPU.
+        workers: Number of workers; None: one per four cores on CPU, or per two on GPUs, and at least one for each GPU.
     """
     from warp_ar.device import resolve_device
 
@@ -64,10 +64,10 @@ def devices_of(device: str, workers: int | None) -> list[str]:
 
 
 def cores_of(devices: Sequence[str]) -> list[list[int]]:
-    """Return the cores of each worker; none where the system does not let a process keep to some.
+    """Return the cores of each worker; empty if the system cannot bind a process to cores.
 
-    On CPU each has its own, as evenly as they go, and shared where there are more workers than cores. Workers of one
-    GPU share its part of them: while one waits for its GPU or its encoder, another goes on.
+    On CPU each worker has its own cores, evenly distributed, or shared ones if there are more workers than cores.
+    Workers of one GPU share the cores of that GPU: while one waits for GPU or encoder, another runs.
     """
     if not hasattr(os, "sched_getaffinity"):
         return [[] for _ in devices]
@@ -82,7 +82,7 @@ def cores_of(devices: Sequence[str]) -> list[list[int]]:
 
 @contextlib.contextmanager
 def keeping_to(cores: Sequence[int]) -> Iterator[None]:
-    """Have threads that are started within keep to some cores; without any, change nothing."""
+    """Context in which started threads are bound to the given cores; without cores it does nothing."""
     if not cores or not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -95,29 +95,29 @@ def keeping_to(cores: Sequence[int]) -> Iterator[None]:
 
 
 class Pool(ABC):
-    """Workers, wherever they are, and a thread for each that waits for it."""
+    """Workers of any kind, each with a thread that waits for it."""
 
     def __init__(self, size: int) -> None:
-        """Have so many workers."""
+        """Start the threads for ``size`` workers."""
         self.size = size
         self._closed = False
-        multiprocessing.resource_tracker.ensure_running()  # here: its start lets interrupts through again
+        multiprocessing.resource_tracker.ensure_running()  # here, because its start unblocks interrupts
         self._threads = [ThreadPoolExecutor(1, "warp_ar-worker", initializer=_hold_interrupts) for _ in range(size)]
 
     def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
-        """Hand a job to a worker that has none; the future raises RunError where the run cannot go on."""
+        """Submit a job to an idle worker; the future raises RunError if the run cannot go on."""
         return self._threads[worker].submit(self._do, worker, job, arguments)
 
     @abstractmethod
     def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
-        """Have a job done; its state is ``lost`` where its workers always die."""
+        """Have a job done; its state is ``lost`` if its workers die repeatedly."""
 
     @abstractmethod
     def _end(self) -> None:
         """End every worker at once."""
 
     def close(self) -> None:
-        """End every worker at once, and wait for their end."""
+        """End every worker at once, and wait until they have ended."""
         self._closed = True
         self._end()
         for thread in self._threads:
@@ -125,20 +125,20 @@ class Pool(ABC):
 
 
 def _hold_interrupts() -> None:
-    """Keep interrupts of the terminal from processes that this thread starts: the driver decides what one ends."""
+    """Block the terminal's interrupts in processes that this thread starts; the driver handles them."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
 
 class ProcessPool(Pool):
-    """Workers as processes of this machine; one that dies is started again, and its job given again."""
+    """Workers as processes of this machine; a dead worker is restarted, and its job repeated."""
 
     def __init__(self, context: Context, devices: Sequence[str]) -> None:
-        """Have the workers started.
+        """Start the workers.
 
         Args:
-            context: Of the run; each worker gets its own device and number.
-            devices: Of each worker.
+            context: Context of the run; each worker gets its own device and index.
+            devices: Device of each worker.
         """
         super().__init__(len(devices))
         self._context, self._devices, self._cores = context, devices, cores_of(devices)
@@ -148,7 +148,7 @@ class ProcessPool(Pool):
             thread.submit(self._ready, worker)
 
     def _ready(self, worker: int) -> ProcessPoolExecutor:
-        """Return a worker's executor once it is ready; RunError where it dies before, again and again."""
+        """Return a worker's executor when it is ready; raise RunError if it dies before that repeatedly."""
         for _ in range(STARTS):
             if worker not in self._executors:
                 context = dataclasses.replace(self._context, device=self._devices[worker], worker=worker)
@@ -193,18 +193,18 @@ class ProcessPool(Pool):
 
 
 _worker: tuple[Any, Sequence[int]] | None = None
-"""Worker that does the jobs of this process, and the cores of all workers; None in the driver."""
+"""Worker object and the cores of all workers, in a worker's process; None in the driver."""
 
 
 def _begin(context: Context, cores: Sequence[int], every: Sequence[int]) -> None:
-    """Make this process a worker: one that ends with its driver, keeps to its cores and writes to its log."""
+    """Make this process a worker, which ends with its driver, is bound to its cores and writes to its log."""
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_driver, name="warp_ar-driver", daemon=True).start()
     if cores:
         os.sched_setaffinity(0, cores)
     _write_to_log(context.folder / "log" / f"worker-{context.worker}.log")
-    from warp_ar.farm.work import Work  # here: a driver does without Warp
+    from warp_ar.farm.work import Work  # imported here: a driver does not need Warp
 
     _worker = Work(context), every
 
@@ -217,7 +217,7 @@ def _end_with_driver() -> None:
 
 
 def _do(job: Job, arguments: Any) -> Outcome:
-    """Do a job in this worker's process; a survey may use the cores of all, for others wait for its result."""
+    """Do a job in this worker's process; a survey may use the cores of all workers, which wait for its result."""
     assert _worker is not None
     work, every = _worker
     with keeping_to(every if job.kind == "survey" else ()):
@@ -226,7 +226,7 @@ def _do(job: Job, arguments: Any) -> Outcome:
 
 
 def _write_to_log(path: Path) -> None:
-    """Have all that is printed, by native code too, go to a file."""
+    """Redirect all printed output, including that of native code, to a file."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "ab") as file:
@@ -236,20 +236,20 @@ def _write_to_log(path: Path) -> None:
 
 
 class RayPool(Pool):
-    """Workers as actors: one per GPU of the cluster, or per core where it has none.
+    """Workers as Ray actors: one per GPU of the cluster, or per core without GPUs.
 
-    Ray decides where an actor runs, starts it again when it or its node dies, and gives it its job again.
+    Ray places the actors, restarts an actor that has died or lost its node, and repeats its job.
     """
 
     def __init__(self, address: str | None, workers: int | None) -> None:
-        """Connect.
+        """Connect to a cluster.
 
         Args:
-            address: Of the cluster; None: the one that runs here, else one that is started for this run.
-            workers: Their number; None: as many as the cluster has GPUs, or cores.
+            address: Address of the cluster; None: the one on this machine, or a new one for this run.
+            workers: Number of workers; None: the cluster's number of GPUs, or of cores.
 
         Raises:
-            UsageError: Ray is not installed, or nothing answers at the address.
+            UsageError: Ray is not installed, or no cluster answers at the address.
         """
         try:
             import ray
@@ -263,11 +263,11 @@ class RayPool(Pool):
         self._actors: list[Any] = []
 
     def employ(self, context: Context) -> RayPool:
-        """Have the actors started for a run."""
+        """Start the actors for a run."""
         from warp_ar.farm.work import Work
 
         needs = {"num_gpus": share_of_gpu(self.size, self._gpus)} if self._gpus else {"num_cpus": 1}
-        # A node that is busy or gone comes back, or another does: so does the actor, and its job is given again.
+        # After a node is lost, the actor is restarted there or on another node, and its job repeated.
         actor = self._ray.remote(Work).options(max_restarts=-1, max_task_retries=DEATHS, **needs)
         device = "cuda" if self._gpus else "cpu"
         for worker in range(self.size):
@@ -291,13 +291,13 @@ class RayPool(Pool):
 
 
 def share_of_gpu(workers: int, gpus: int) -> float:
-    """Return the part of a GPU that each worker takes, so that all find room; Ray counts ten-thousandths."""
+    """Return the share of a GPU for each worker, so that all fit; Ray counts in ten-thousandths."""
     on_one = -(-workers // gpus)
     return 1 if on_one == 1 else math.floor(1e4 / on_one) / 1e4
 
 
 def _connect(ray: Any, address: str | None) -> None:
-    """Connect to a cluster, in a time that is bounded: Ray itself takes half a minute to say that nobody listens."""
+    """Connect to a cluster within a limited time: Ray takes half a minute to report that there is none."""
     options = {"logging_level": "ERROR", "log_to_driver": False}
     if address is None:
         try:
@@ -313,7 +313,7 @@ def _connect(ray: Any, address: str | None) -> None:
     def connect() -> None:
         try:
             future.set_result(ray.init(address=address, **options))
-        except Exception as error:  # Ray raises whatever its transport does
+        except Exception as error:  # Ray raises any error of its transport
             future.set_exception(error)
 
     try:

@@ -1,24 +1,26 @@
-"""The first, cheap pass over a clip: where its camera stood in every frame, and by what light.
+"""Survey of a clip: a first, cheap pass that finds the camera's pose in every frame and the light.
 
-All segments and variations of the clip start from it: poses are given, the light is given, and so a frame's picture
-does not depend on which frames were lit before it. The file is a ZIP of NumPy arrays, as ``numpy.load`` reads it:
+All segments and variations of the clip use it. With given poses and light, a frame's picture does not depend on the
+frames lit before it. The file is a ZIP of NumPy arrays for ``numpy.load``:
 
-- ``ticks`` (n,) int64 and ``tick`` (2,) int64: time stamps of the frames, and the seconds of a tick as a fraction;
-- ``poses`` (n, 12) float64: ``camera_from_world``, R row by row and t in metres; NaN where the marker was lost;
+- ``ticks`` (n,) int64 and ``tick`` (2,) int64: time stamps of frames, and the seconds of a tick as a fraction;
+- ``poses`` (n, 12) float64: ``camera_from_world``, R by rows and t in metres; NaN where the marker was lost;
 - ``saturation`` (3,) float64: codes at which the camera's channels saturate;
 - ``size`` (2,) int64: width and height of the frames in pixels;
-- ``coding`` str: what a video of the recording's own depth is encoded in;
-- ``keys`` (k,) int64: numbers of the frames from which on each of the k maps holds;
-- ``places`` (k + 1,) int64: where in ``lights.bin`` each begins, and where the last ends.
+- ``coding`` str: coding of a video at the recording's own bit depth;
+- ``keys`` (k,) int64: index of the frame from which each of the k maps is used;
+- ``places`` (k + 1,) int64: offset in ``lights.bin`` of each map, and the end of the last.
 
-``lights.bin`` holds maps one after another, so that one of 100,000 is read as quickly as one of two: each a zlib stream
-of a map, float32 (h, 2 h, 3), and, where the quality finds their places, its emitters, as ``numpy.save`` has both.
+``lights.bin`` contains the maps one after another, so that reading one does not depend on their number. Each is a zlib
+stream of a map, float32 (h, 2 h, 3), followed by its emitters if the quality finds their positions, both as written by
+``numpy.save``.
 
-A key is written once a texel of the environment has moved by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE *
-value``) since the last key: the tolerance within which stages that read the environment do not run again either.
+A key is written when a texel of the environment has changed by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE
+* value``) since the last key. Stages that read the environment use the same tolerance.
 
-Poses and light of a frame rest on the frames before it, so a clip is surveyed in order; while the marker of one is
-looked for, kernels gather the light of the one before, and a thread compares and packs that of those before it.
+Poses and light of a frame depend on the frames before it, so a clip is surveyed in order. While the marker of a frame
+is searched for, kernels process the light of the previous one, and a thread compares and compresses that of earlier
+ones.
 """
 
 from __future__ import annotations
@@ -58,27 +60,27 @@ Map = npt.NDArray[np.float32]
 NAME = "survey.npz"
 MAPS = "lights.bin"
 LIGHT = "light.exr"
-"""The environment at the clip's end, with the emitters that were found."""
+"""File of the environment at the clip's end, with its emitters."""
 WAITING = 4
-"""Frames at most whose light waits to be compared with the last that was kept."""
+"""Largest number of frames whose light waits to be compared with the last key."""
 _MANTISSA = 12
-"""Bits of a radiance that are kept: a relative error of 2^-13, a hundredth of what a key may be off; the rest is noise
-that does not compress."""
+"""Mantissa bits of stored radiance: the relative error of 2^-13 is a hundredth of a key's tolerance. Further bits are
+noise that does not compress."""
 
 
 class Survey:
-    """The result of a survey; maps are read when they are asked for."""
+    """Result of a survey; maps are read on demand."""
 
     def __init__(self, folder: Path) -> None:
-        """Open the survey of a folder.
+        """Open the survey in a folder.
 
         Raises:
-            SourceError: It is damaged or not there.
+            SourceError: The survey is damaged or missing.
         """
         self._path, self._maps = folder / NAME, folder / MAPS
         self.light_file = folder / LIGHT
         try:
-            # Opened here: of a damaged file NumPy leaves its own open.
+            # Opened here, because NumPy does not close a damaged file that it has opened itself.
             with open(self._path, "rb") as stream, np.load(stream) as values:
                 numerator, denominator = (int(v) for v in values["tick"])
                 tick = fractions.Fraction(numerator, denominator)
@@ -95,19 +97,19 @@ class Survey:
             raise SourceError(f"{self._path} cannot be read: {reason(error)}; remove its folder and resume") from error
 
     def pose(self, frame: int) -> Pose | None:
-        """Return the camera's pose; None where the marker was lost."""
+        """Return the camera's pose in a frame; None if the marker was lost."""
         row = self.poses[frame]
         return None if np.isnan(row[0]) else Pose(row[:9].reshape(3, 3), row[9:])
 
     def key_of(self, frame: int) -> int:
-        """Number of the map that holds for a frame."""
+        """Return the index of the map for a frame."""
         return max(int(np.searchsorted(self.keys, frame, side="right")) - 1, 0)
 
     def light(self, key: int) -> tuple[Map, npt.NDArray[Any] | None]:
-        """A map, float32 (h, 2 h, 3), and where its emitters are: records of ``Emitter``, if they are known.
+        """Return a map, float32 (h, 2 h, 3), and its emitters as records of ``Emitter``; None if they are not known.
 
         Raises:
-            SourceError: It is damaged or not there.
+            SourceError: The map is damaged or missing.
         """
         begin, end = (int(place) for place in self._places[key : key + 2])
         try:
@@ -127,12 +129,12 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
 
     Args:
         jobs: The job file.
-        clip: Number of the clip.
-        folder: Where to write; it is there, and empty.
+        clip: Index of the clip.
+        folder: Existing, empty folder to write to.
         device: ``cpu`` or ``cuda:N``.
 
     Returns:
-        Frames of the clip, and those whose marker was found.
+        Number of frames of the clip, and of those in which the marker was found.
 
     Raises:
         WarpArError: The clip or its scene cannot be used.
@@ -186,7 +188,7 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
 
 @dataclasses.dataclass
 class _Look:
-    """Poses and light, gathered while frames flow."""
+    """Poses and light, collected while frames are lit."""
 
     light: str
     """One of ``LIGHTS``."""
@@ -197,16 +199,16 @@ class _Look:
     places: list[int] = dataclasses.field(default_factory=lambda: [0])
     saturation: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.full(3, 255.0))
     latest: tuple[Map, npt.NDArray[Any] | None] | None = None
-    """Environment and emitters of the last frame whose marker was found."""
+    """Environment and emitters of the last frame with a marker."""
     kept: tuple[Map, npt.NDArray[Any] | None] | None = None
-    """Those of the last key."""
+    """Environment and emitters of the last key."""
     shape: tuple[int, ...] = (0, 0, 3)
     """Shape of every map."""
 
     def take(self, frame: int, result: Result) -> None:
-        """Wait for the pose and the light of a frame; where all of its light is wanted, ``keep`` it."""
+        """Wait for the pose and the light of a frame; call ``keep`` if the light of every frame is stored."""
         if result.pose is None:
-            _ = result.stages  # waits, and raises what went wrong
+            _ = result.stages  # waits, and raises errors of the frame
             return
         self.poses[frame] = (*result.pose.rotation.ravel(), *result.pose.translation)
         self.latest = None if result.environment is None else (result.environment, result.emitters)
@@ -214,7 +216,7 @@ class _Look:
             self.keep(frame, *self.latest)
 
     def keep(self, frame: int, environment: Map, emitters: npt.NDArray[Any] | None) -> None:
-        """Write an environment if it has moved since the last one that was written, or its emitters have."""
+        """Write an environment as a key if it or its emitters have changed since the last key."""
         if self.kept is not None:
             last, before = self.kept
             same = emitters is None or (before is not None and emitters.tobytes() == before.tobytes())
@@ -230,7 +232,7 @@ class _Look:
 def _look_at_frames(
     scene: Scene, source: RecordedSource, look: _Look, quality: str, device: str, *, captures: bool
 ) -> None:
-    """Follow the camera and, where the frames are to tell it, the light; a thread packs what came of frames before."""
+    """Track the camera and, if ``captures``, measure the light; a thread compresses the light of earlier frames."""
     with contextlib.closing(source), ThreadPoolExecutor(1, "warp_ar-survey") as packer:
         linear = keep_depth(source, scene)
         pipeline = Pipeline(
@@ -246,7 +248,7 @@ def _look_at_frames(
         waiting: collections.deque[Future[None]] = collections.deque()
         with pipeline:
             for frame in source:
-                frame.image.flags.writeable = False  # so that it need not be copied to wait for its turn
+                frame.image.flags.writeable = False  # so that the pipeline need not copy it
                 pose = given_pose(scene.pose, frame)
                 result = pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
                 waiting.append(packer.submit(look.take, frame.index, result))
@@ -258,10 +260,10 @@ def _look_at_frames(
 
 
 def keep_depth(source: RecordedSource, scene: Scene) -> bool:
-    """Have a source keep what of its pictures is more than 8 bits; whether there is such.
+    """Have a source keep the full bit depth of its pictures; return True if they have more than 8 bits.
 
     Raises:
-        UsageError: They are linear light, which does not fit the camera's transfer.
+        UsageError: The pictures are linear, which does not fit the camera's transfer function.
     """
     if source.deep == "light":
         check_linear(str(scene.camera.transfer))
@@ -270,14 +272,14 @@ def keep_depth(source: RecordedSource, scene: Scene) -> bool:
 
 
 def _rounded(values: Map) -> Map:
-    """Values with the last bits of their mantissa rounded away."""
+    """Return values with the lowest bits of the mantissa rounded off."""
     drop = 23 - _MANTISSA
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
     return ((bits + np.uint32(1 << (drop - 1))) & np.uint32(0xFFFFFFFF << drop & 0xFFFFFFFF)).view(np.float32)
 
 
 def lit_scene(jobs: JobFile, clip: int, survey: Survey) -> Scene:
-    """The scene of a clip, lit by what its survey captured.
+    """Return the scene of a clip with the light that its survey captured.
 
     Raises:
         SceneError: The light cannot be read.

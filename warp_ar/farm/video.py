@@ -1,9 +1,9 @@
-"""A segment as video, and segments joined into one recording without encoding again.
+"""Segments as videos, and their concatenation to one recording without re-encoding.
 
-Frames keep the time stamps of the recording that they come from, so that a variable rate stays what it was and the
-recording's own sound fits. Segments have no B-frames: a packet's decoding time is then its picture's, and packets of
-one segment follow those of another whatever their times are. The encoder's threads are fixed, for its bytes depend on
-their number.
+Frames keep the time stamps of their recording, so that a variable frame rate is preserved and the recording's sound
+fits. Segments have no B-frames: the decoding time of each packet then equals its presentation time, and packets of one
+segment can follow those of another at any times. The number of the encoder's threads is fixed, because the encoded
+bytes depend on it.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from warp_ar.output.video_sink import VideoSink, tag_for_players
 from warp_ar.signature import PROGRAM
 
 ENCODER_THREADS = 2
-"""Threads of x264 and x265, the same on every machine."""
+"""Number of threads of x264 and x265, the same on every machine."""
 _X264 = "rc-lookahead=10:mbtree=1"
-"""With these of `veryfast`, x264's preset `superfast` looks no less far ahead. What it leaves out is the search for
-motion by fractions of a pixel: three fifths of the processor time for a twentieth more bytes and 0.1 codes of error."""
+"""Options of preset `veryfast` that give x264's `superfast` the same lookahead. It still omits subpixel motion search:
+three fifths of the processor time, for a twentieth more bytes and 0.1 codes of error."""
 _X265 = f"pools=none:frame-threads={ENCODER_THREADS}:open-gop=0"
-"""x265's threads that share a picture depend on the machine's cores: there are none, only some that take one each."""
+"""Options of x265 without its thread pool, which depends on the number of cores; only frame threads are used."""
 _MOST_SCALE = 100_000_000
 _LANGUAGES = ("language", "title", "handler_name")
-"""Metadata of a stream that stays true in another file."""
+"""Metadata of a stream that remain valid in another file."""
 
 
 def part_encoding(coding: str = "8bit") -> Encoding:
-    """Return the encoding of segments: H.264 in 8 bits, else H.265; the same bytes on every machine.
+    """Return the encoding of segments: H.264 for 8 bits, else H.265; its bytes are the same on every machine.
 
     Args:
         coding: One of ``CODINGS``.
 
     Raises:
-        SinkError: The encoder is not there.
+        SinkError: The encoder is missing.
     """
     if coding == "8bit":
         own = {"preset": "superfast", "threads": str(ENCODER_THREADS), "x264-params": _X264}
@@ -52,17 +52,17 @@ def part_encoding(coding: str = "8bit") -> Encoding:
 
 
 def open_part_sink(path: Path, tick: fractions.Fraction, fps: float, coding: str, transfer: str) -> VideoSink:
-    """Open a segment's video, whose frames come by ``write_at``.
+    """Open a segment's video; frames are added by ``write_at``.
 
     Args:
         path: The file.
-        tick: Seconds of a tick of the recording.
-        fps: Mean rate of the whole recording: all its parts have one header.
+        tick: Duration of a tick of the recording in seconds.
+        fps: Mean frame rate of the whole recording, for a common header of all segments.
         coding: One of ``CODINGS``.
-        transfer: The camera's, by which 10-bit codes are encoded.
+        transfer: Transfer function of the camera, by which 10-bit codes are encoded.
 
     Raises:
-        SinkError: The encoder is not there.
+        SinkError: The encoder is missing.
     """
     return VideoSink(path, fps=fps, encoding=part_encoding(coding), transfer=transfer, tick=tick)
 
@@ -77,22 +77,22 @@ def join_parts(
     zero: int = 0,
     until: float | None = None,
 ) -> int:
-    """Put segments into one file, packet by packet, with the sound and the metadata of the recording.
+    """Concatenate segments packet by packet into one file, with the recording's sound and metadata.
 
     Args:
-        parts: Videos of ``open_part_sink``, in order.
-        starts: Time stamp of each one's first frame in the recording, in ticks.
-        tick: Seconds of a tick.
+        parts: Videos from ``open_part_sink``, in order.
+        starts: Time stamp in the recording of each segment's first frame, in ticks.
+        tick: Duration of a tick in seconds.
         output: The MP4 to write.
-        recording: Where sound and metadata come from; None where it is no video.
-        zero: Time stamp in ticks that becomes 0 of the file.
-        until: Seconds of the recording at which what was lit ends, so that the sound ends there; None: at its own end.
+        recording: Source of sound and metadata; None if it is not a video.
+        zero: Time stamp in ticks that becomes 0 in the file.
+        until: Time in seconds of the recording at which the sound ends; None: at its own end.
 
     Returns:
-        Frames of the file.
+        Number of frames of the file.
 
     Raises:
-        SinkError: It cannot be written.
+        SinkError: The file cannot be written.
         SourceError: A segment or the recording cannot be read.
     """
     try:
@@ -126,9 +126,10 @@ def join_parts(
 
 
 def _common_scale(tick: fractions.Fraction, source: Any) -> int:
-    """Units a second in which every stream's start is a whole number.
+    """Return the time units per second in which every stream's start is an integer.
 
-    Where a stream does not begin at 0, an edit list says so in this unit; MP4's usual milliseconds would round it.
+    If a stream does not begin at 0, an edit list states its start in this unit; MP4's usual milliseconds would round
+    it.
     """
     ticks = [tick, *(stream.time_base for stream in source.streams.audio if stream.time_base)] if source else [tick]
     scale = math.lcm(*(fractions.Fraction(unit).denominator for unit in ticks))
@@ -138,7 +139,7 @@ def _common_scale(tick: fractions.Fraction, source: Any) -> int:
 def _video_packets(
     parts: Sequence[Path], starts: Sequence[int], tick: fractions.Fraction, header: bytes, zero: int
 ) -> Iterator[tuple[float, Any]]:
-    """Packets of all segments with their time stamps in the file, in ticks."""
+    """Yield packets of all segments, with their time stamps in the file, in ticks."""
     for path, start in zip(parts, starts, strict=True):
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
@@ -160,7 +161,7 @@ def _video_packets(
 
 
 def _sound(source: Any, target: Any, zero: float, until: float | None) -> Iterator[tuple[float, Any]]:
-    """Sound packets of a recording with their times in seconds of the file, as they were encoded."""
+    """Yield a recording's encoded sound packets, with their times in the file, in seconds."""
     streams = {}
     for stream in source.streams.audio:
         made = target.add_stream_from_template(stream)
@@ -178,7 +179,7 @@ def _sound(source: Any, target: Any, zero: float, until: float | None) -> Iterat
                 continue
             shift = round(zero / float(packet.time_base))
             packet.pts -= shift
-            packet.dts = packet.pts  # sound is never reordered
+            packet.dts = packet.pts  # sound packets are never reordered
             packet.stream = streams[packet.stream.index]
             yield seconds, packet
 

@@ -1,4 +1,4 @@
-"""A worker's jobs, in whatever process or actor it runs: files in, files out, a record back."""
+"""Jobs of a worker, in a process or an actor: reads and writes files, and returns a record."""
 
 from __future__ import annotations
 
@@ -43,26 +43,26 @@ from warp_ar.files import take_name
 from warp_ar.scene import SourceSpec, dumps_scene
 
 PART = "frames.mp4"
-"""A segment's frames."""
+"""File with a segment's frames."""
 DIGESTS = ".sha256"
-"""Ending of the file of pictures' digests: a line each, in hexadecimal digits."""
+"""Ending of the file of picture digests, with one hexadecimal digest per line."""
 
 LEAST_FREE = 1 << 20
-"""Bytes below which a disk is full, whatever a library says of its failure."""
+"""Free bytes below which a disk counts as full, whichever error a library reports."""
 
 
 class Work(Closing):
-    """Does one job after another; one for each worker."""
+    """Does jobs one after another; each worker has one."""
 
     def __init__(self, context: Context) -> None:
-        """Do nothing yet."""
-        cv2.setNumThreads(1)  # with more, to look for a marker takes more processor time and is no sooner done
-        threadpoolctl.threadpool_limits(1)  # results of BLAS depend on their number
+        """Set the numbers of threads; no job is begun."""
+        cv2.setNumThreads(1)  # with more threads, finding a marker takes more processor time but no less time
+        threadpoolctl.threadpool_limits(1)  # results of BLAS depend on the number of threads
         self.context = context
         self._lighter = Lighter(context.jobs, context.folder, context.device)
 
     def close(self) -> None:
-        """Let threads go."""
+        """End the threads."""
         self._lighter.close()
 
     def version(self) -> str:
@@ -70,11 +70,11 @@ class Work(Closing):
         return program_version()
 
     def do(self, job: Job, arguments: Any = None) -> Outcome:
-        """Do a whole job; failures are returned, not raised.
+        """Do a whole job; errors are returned, not raised.
 
         Args:
             job: The job.
-            arguments: Of jobs that need to know more: the places of finished variations.
+            arguments: Further data of some jobs: the folders of finished variations.
         """
         context = self.context
         key, start = job.key(context.jobs), time.perf_counter()
@@ -82,7 +82,7 @@ class Work(Closing):
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
             values = self._do(job, arguments)
-        except Exception as error:  # whatever it is, it is this job's alone, and its reason is kept
+        except Exception as error:  # any error fails only this job, and its reason is kept
             known = isinstance(error, WarpArError | NoPlace)
             told = str(error) if known else f"{type(error).__name__}: {reason(error)}"
             _note(log, f"failed: {told}", "" if known else traceback.format_exc())
@@ -91,7 +91,7 @@ class Work(Closing):
             return Outcome("full" if full else "failed", reason=told)
         finally:
             if job.kind == "survey" or context.jobs.settings.light == "preroll":
-                gc.collect()  # a pipeline of its own has gone, whose arrays are large and part of cycles
+                gc.collect()  # the large arrays of the job's own pipeline are part of reference cycles
         seconds = time.perf_counter() - start
         frames = int(values.get("frames", 0))
         _note(log, f"done: {frames} frames in {seconds:.2f} s by worker {context.worker} on {context.device}")
@@ -153,7 +153,7 @@ class Work(Closing):
         base = dataclasses.replace(base, camera=base.camera.scaled_to(*survey.size), source=None)
         poses = [pose for pose in map(survey.pose, range(job.first, job.end, dataset.every)) if pose is not None]
         drawn = draw_variation(base, dataset, job.clip, job.number, poses)
-        # By its own light: where the run keeps what was captured is no part of a data set.
+        # Without the path of the captured light, which lies in the run's folder and not in the data set.
         path, fps = source_of(jobs, job.clip)
         own = scene_of(jobs, job.clip).captured
         shown = dataclasses.replace(drawn.scene, source=SourceSpec(path=path, fps=fps), captured=own)
@@ -193,7 +193,7 @@ class Work(Closing):
 
 
 def digest_of(picture: npt.NDArray[Any]) -> str:
-    """SHA-256 of a picture's bytes, row by row, in hexadecimal digits; other threads go on meanwhile."""
+    """Return SHA-256 of a picture's bytes, row by row, in hexadecimal; other threads run meanwhile."""
     return hashlib.sha256(np.ascontiguousarray(picture).data).hexdigest()
 
 
@@ -205,13 +205,13 @@ def _free_bytes(folder: Path) -> int:
 
 
 def _replace_models(part: Path, place: Path) -> None:
-    """Move a folder of models to its place; what stood there goes."""
+    """Move a folder of models to its place, replacing an existing one."""
     shutil.rmtree(place, ignore_errors=True)
     take_name(part, place)
 
 
 def _note(log: Path, line: str, more: str = "") -> None:
-    """Add to a job's log; a disk that is full loses the line, not the job."""
+    """Append to a job's log; if the disk is full, the line is lost, but the job goes on."""
     try:
         with open(log, "a", encoding="utf-8") as stream:
             stream.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n{more}")
