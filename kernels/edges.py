@@ -1,7 +1,7 @@
-"""Edges that are sampled on their own.
+"""Anti-aliasing of edges in kernels of their own.
 
-Samples of edges take many times as long as the pixels around them. On a CPU they are taken in place; on CUDA that
-holds up whole warps, and edges are listed first, their samples taken side by side and averaged afterwards.
+Edge pixels take many samples, other pixels one. On a CPU edges are sampled in place. On CUDA that would stall whole
+warps, so edge pixels are listed first, their samples are computed in parallel, and averaged afterwards.
 """
 
 import dataclasses
@@ -23,22 +23,22 @@ EDGE_THREADS = 1 << 16
 class EdgeList:
     """The pixels in which edges lie."""
 
-    count: wp.array[wp.int32]  # (1,): edges found, which may be more than there are places
+    count: wp.array[wp.int32]  # (1,): number of edges found, which may exceed n
     edges: wp.array[wp.vec2i]  # (n,): row and column of each
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EdgeLists:
-    """Scratch arrays for edges that are sampled on their own; where they do not hold all, all are sampled in place."""
+    """Scratch arrays for listed edges. If they cannot hold all edges, all are sampled in place instead."""
 
     listed: EdgeList
     """Edges found."""
     samples: wp.array[wp.vec4]
-    """(n * edge_samples,): radiance, and coverage or how much the sample counts."""
+    """(n * edge_samples,): radiance, and coverage or the sample's weight."""
 
     @classmethod
     def of(cls, count: wp.array, edges: wp.array, samples: wp.array) -> "EdgeLists":
-        """Of arrays (1,) int32, (n,) vec2i and (n * edge_samples,) vec4."""
+        """Return ``EdgeLists`` of arrays (1,) int32, (n,) vec2i and (n * edge_samples,) vec4."""
         listed = EdgeList()
         listed.count, listed.edges = count, edges
         return cls(listed, samples)
@@ -46,7 +46,7 @@ class EdgeLists:
 
 @wp.func
 def list_edge(i: wp.int32, j: wp.int32, list_out: EdgeList):
-    """Put a pixel on the list, if there is environment; it is counted in any case."""
+    """Count an edge pixel, and append it to the list if there is room."""
     place = wp.atomic_add(list_out.count, 0, 1)
     if place < list_out.edges.shape[0]:
         list_out.edges[place] = wp.vec2i(i, j)
@@ -54,13 +54,13 @@ def list_edge(i: wp.int32, j: wp.int32, list_out: EdgeList):
 
 @wp.func
 def holds_all(listed: EdgeList) -> wp.bool:
-    """Return whether the list had a place for every edge."""
+    """Return whether the list holds every edge."""
     return listed.count[0] <= listed.edges.shape[0]
 
 
 @wp.func
 def listed_edges(listed: EdgeList) -> wp.int32:
-    """Edges in the list; none where it did not hold all."""
+    """Return the number of listed edges; 0 if the list does not hold all."""
     return wp.where(holds_all(listed), listed.count[0], 0)
 
 
@@ -69,8 +69,8 @@ def make_average_edges_kernel(weighted: bool) -> wp.Kernel:
     """Kernel that averages the samples of every listed edge, in their order.
 
     Args:
-        weighted: Whether the fourth component says how much a sample counts, 0 or 1, and the mean goes without it; else
-            it is one of the values.
+        weighted: If True, the fourth component is the sample's weight, 0 or 1, and not written. If False, it is
+            averaged like the other three.
     """
     value_type = wp.vec3 if weighted else wp.vec4
 
@@ -104,15 +104,15 @@ def make_average_edges_kernel(weighted: bool) -> wp.Kernel:
 def sample_listed_edges(
     kernel: wp.Kernel, inputs: Sequence[Any], lists: EdgeLists, count: int, values_out: wp.array, *, weighted: bool
 ) -> None:
-    """Take the samples of all edges that were listed, side by side, and write their means.
+    """Compute the samples of all listed edges in parallel, and write their means.
 
     Args:
-        kernel: Takes the number of threads, ``inputs``, and the listed edges, and writes samples.
-        inputs: Of the kernel.
-        lists: Edges; its samples are written.
-        count: Samples of an edge.
-        values_out: (H, W) vec3 if ``weighted``, else vec4; written where an edge is.
-        weighted: As ``make_average_edges_kernel`` has it.
+        kernel: Kernel that takes the number of threads, ``inputs`` and the listed edges, and writes samples.
+        inputs: Inputs of the kernel.
+        lists: Listed edges; samples are written.
+        count: Samples per edge pixel.
+        values_out: (H, W) vec3 if ``weighted``, else vec4; written in edge pixels only.
+        weighted: As in ``make_average_edges_kernel``.
     """
     device = values_out.device
     launch(kernel, EDGE_THREADS, [EDGE_THREADS, *inputs, lists.listed], [lists.samples], device=device)

@@ -1,4 +1,4 @@
-"""Emitters of the environment that stand near: what surfaces away from the ball receive of them.
+"""Near emitters of the environment: their irradiance away from the ball, and the parallax of their reflections.
 
 The environment holds an emitter as the ball mirrors it to the camera, at a point c of its surface: direction d,
 distance D and power p, which is the irradiance of a surface at c that faces it. At a point x with normal n, the vector
@@ -6,21 +6,21 @@ to the emitter being r = c + D d - x, it is
 
     E(x) = p (D / |r|)^2 max(n.r / |r|, 0)     and not, as the environment has it,     p max(n.d, 0).
 
-What is in the way is left out, as irradiance of the environment leaves it out.
+Occlusion is ignored, as in the environment's irradiance.
 
-What mirrors shows the emitter along r as well. The environment is looked up there as if it were bent: for the direction
-w by the angle that turns u = r / |r| to d, times
+A mirror shows the emitter along r as well. So look-ups of the environment in a direction w are rotated by the angle
+that turns u = r / |r| to d, times
 
-    (1 - s^4)^2,    s = |w - u| / max(REACH, 2.5 |d - u|) < 1,
+    (1 - s^4)^2,    s = |w - u| / max(REACH, 2.5 |d - u|) < 1.
 
-so that the emitter, and the glow around it, is seen once, at its place and undistorted, and what is farther from it
-stays. The factor keeps it one-to-one: (1 - s^4)^2 falls by no more than 2.2 per unit of s. Parts of one window are
-emitters side by side, which all turn much the same way; what lies between must not be turned by all of them in turn.
-With an emitter's factor f and its turn v, a rotation vector,
+Then the emitter and the glow around it appear once, in the right direction and undistorted, and directions farther away
+do not change. The map of directions is one-to-one, because (1 - s^4)^2 falls by at most 2.2 per unit of s. Parts of one
+window are emitters side by side, whose rotations are nearly equal; directions between them must not be rotated by all
+of them in sequence. With an emitter's factor f and its rotation vector v, the combined rotation
 
-    v = sum g v / (1 + sum g),    g = f / (1 - f),
+    sum g v / (1 + sum g),    g = f / (1 - f),
 
-is f v for one emitter, between theirs for several, and each emitter's own where it stands.
+is f v for one emitter, lies between their rotations for several, and equals an emitter's own v in its direction.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ MAX_DISTANCE = wp.constant(wp.float32(100.0))
 MAX_GAIN = wp.constant(wp.float32(16.0))
 """Largest (D / |r|)^2: emitters have a size, and their distances an error."""
 REACH = wp.constant(wp.float32(0.2))
-"""Radians around a near emitter that turn with it, at least."""
+"""Least angular radius, radians, around a near emitter within which directions are rotated."""
 NEARLY_ALL = wp.constant(wp.float32(1.0e-6))
-"""Least 1 - f: closer to an emitter its turn is as good as alone."""
+"""Least value of 1 - f, to bound g."""
 LEAST_TURN = wp.constant(wp.float32(1.0e-4))
-"""Radians that are not worth turning: the axis is known to some 1e-7 over that."""
+"""Least rotation that is applied, radians: the axis has an error of some 1e-7 over the angle."""
 
 
 @wp.func
 def add_emitters(irradiance: wp.vec3, emitters: wp.array[Emitter], point: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """Irradiance of the environment at a surface, with near emitters at their places; never negative."""
+    """Return the environment's irradiance at a surface, with near emitters at their positions; never negative."""
     result = irradiance
     for k in range(emitters.shape[0]):
         emitter = emitters[k]
-        # A emitter that is none has the distance 0.
+        # Unused records have the distance 0.
         if emitter.distance > 0.0 and emitter.distance < MAX_DISTANCE:
             to_emitter = emitter.origin + emitter.distance * emitter.direction - point
             away = wp.max(wp.length(to_emitter), 1.0e-4)
@@ -61,11 +61,11 @@ def add_emitters(irradiance: wp.vec3, emitters: wp.array[Emitter], point: wp.vec
 
 @wp.func
 def emitter_weight(away: wp.float32, off: wp.float32) -> wp.float32:
-    """Weight of an emitter for a direction ``away`` from it, as derived above; both are lengths between unit vectors.
+    """Return the factor f of an emitter for a direction, as derived above.
 
     Args:
-        away: From where the emitter is seen from the point.
-        off: From there to where the environment shows it.
+        away: |w - u|, distance between the direction and the emitter's direction from the point.
+        off: |d - u|, distance between the emitter's directions in the environment and from the point.
     """
     s = away / wp.max(REACH, 2.5 * off)
     if s >= 1.0:
@@ -76,7 +76,7 @@ def emitter_weight(away: wp.float32, off: wp.float32) -> wp.float32:
 
 @wp.func
 def correct_parallax(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """Unit direction in which the environment shows what is seen from a point along a unit direction."""
+    """Return the unit direction of the environment that a point sees along the unit direction ``direction``."""
     spin = wp.vec3(0.0)
     weights = float(1.0)
     for k in range(emitters.shape[0]):
@@ -101,7 +101,7 @@ def correct_parallax(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.
 
 @wp.func
 def seen_from(emitter: Emitter, place: wp.vec3) -> Emitter:
-    """An emitter as a map of the light at another place holds it; a distant one as it is."""
+    """Return an emitter as the environment at ``place`` shows it; a distant one unchanged."""
     out = emitter
     if emitter.distance > 0.0 and emitter.distance < MAX_DISTANCE:
         to_emitter = emitter.origin + emitter.distance * emitter.direction - place
@@ -116,9 +116,9 @@ def seen_from(emitter: Emitter, place: wp.vec3) -> Emitter:
 
 @wp.func
 def solid_angle_gain(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.float32:
-    """Ratio of the solid angle of what a point sees along a unit direction to that in the environment.
+    """Return the ratio of solid angles along a direction, seen from a point and in the environment.
 
-    (D / |r|)^2 where an emitter stands, 1 far from all, between them by the weights of ``correct_parallax``.
+    It is (D / |r|)^2 in an emitter's direction and 1 far from all, interpolated by the weights of ``correct_parallax``.
     """
     gain = float(1.0)
     weights = float(1.0)

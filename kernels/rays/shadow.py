@@ -1,4 +1,4 @@
-"""Virtual lights: what arrives from one at a point, and whether something stands between.
+"""Virtual lights: their irradiance at a point, and their shadows.
 
 The scale of a light is the scene format's: a white Lambertian surface that faces a light of radiant intensity I at
 distance d has linear camera value I / (pi d^2), so the irradiance of a surface that faces it is I / d^2 (attenuation
@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 MIN_DISTANCE = wp.constant(wp.float32(1.0e-4))
 
 PROBE_RAYS = 8
-"""Rays to the rim of a sized light and its centre; where they agree, the light is taken as wholly seen or hidden."""
+"""Rays to the rim and the centre of a light with a radius; if all agree, it counts as wholly visible or hidden."""
 SOFT_RAYS = 32
 """Rays to a light that is partly hidden."""
 GOLDEN_ANGLE = wp.constant(wp.float32(math.pi * (3.0 - math.sqrt(5.0))))
@@ -32,16 +32,16 @@ GOLDEN_ANGLE = wp.constant(wp.float32(math.pi * (3.0 - math.sqrt(5.0))))
 
 @wp.struct
 class LightSample:
-    """One light seen from one point, as if nothing stood between."""
+    """One light seen from one point, occlusion ignored."""
 
-    wi: wp.vec3  # unit, toward the light; at the light itself the way back along its direction
+    wi: wp.vec3  # unit, toward the light; at the light itself opposite to its direction
     distance: wp.float32  # metres; FAR for a directional light
     irradiance_normal: wp.vec3  # irradiance of a surface that faces the light
 
 
 @wp.func
 def spot_falloff(light: Light, wi: wp.vec3) -> wp.float32:
-    """1 inside the inner half angle, falling linearly in angle to 0 at the outer one; a step where both are equal.
+    """Return 1 inside the inner half angle, falling linearly in angle to 0 at the outer one; a step if both are equal.
 
     The angle comes from atan2, exact at both ends where acos is not. The axis itself is always inside: a cone of 0
     degrees is a line. Where 1 - x^2 / 2 <= cos x already says that a point is outside, no angle is needed.
@@ -98,7 +98,7 @@ def make_sample_light(kinds: tuple[int, ...]) -> wp.Function:
 ALL_LIGHTS = tuple(sorted(map(int, (POINT, SPOT, DIRECTIONAL))))
 """Kinds of virtual light."""
 sample_light = make_sample_light(ALL_LIGHTS)
-"""``sample_light(light, point) -> LightSample``: what a light of any kind sends to a world point; finite everywhere."""
+"""``sample_light(light, point) -> LightSample``: a light of any kind, seen from a world point; finite everywhere."""
 
 
 @functools.cache
@@ -123,7 +123,7 @@ def make_shadow(config: TraceConfig) -> wp.Function:
 
 @wp.func
 def has_penumbra(light: Light, sample: LightSample) -> wp.bool:
-    """Return whether a light is seen in part from around the point of a sample."""
+    """Return whether a light has penumbrae around the point of a sample."""
     return light.radius > 0.0 and light.kind != DIRECTIONAL and sample.distance > light.radius
 
 
@@ -131,10 +131,10 @@ def has_penumbra(light: Light, sample: LightSample) -> wp.bool:
 def make_visible_share(config: TraceConfig) -> wp.Function:
     """``visible_share(scene, point, geometric_normal, error, light, sample, turn) -> float32``: 0 hidden .. 1 seen.
 
-    A sized light is the disk that it shows to the point. Its centre and rim are tried first; only a penumbra gets the
-    full sunflower of rays, each of which stands for the same part of the disk. ``turn`` rotates the pattern, in turns:
-    given another for every pixel of a small tile, the steps of 1 / ``SOFT_RAYS`` become a fine grain. A light without
-    size, or around the point, is seen or not, as ``make_shadow`` has it.
+    A light with a radius is a disk that faces the point. Its centre and rim are tested first. Only in a penumbra is the
+    full sunflower pattern of rays traced, each of which stands for the same area of the disk. ``turn`` rotates the
+    pattern, in turns: if it differs between the pixels of a small tile, the steps of 1 / ``SOFT_RAYS`` become a fine
+    grain. A light without radius, or one that encloses the point, is visible or not, as in ``make_shadow``.
     """
     is_lit = make_shadow(config)
     occluded = make_trace(config).occluded
@@ -156,7 +156,7 @@ def make_visible_share(config: TraceConfig) -> wp.Function:
         count = wp.int32(PROBE_RAYS)
         k = wp.int32(0)
         while k < count:
-            # The last of the probes is the centre, the others lie on the rim; then the sunflower begins anew.
+            # The last of the first rays goes to the centre, the others to the rim; then the sunflower pattern begins.
             radius = wp.where(k < wp.static(PROBE_RAYS - 1), light.radius, 0.0)
             angle = 2.0 * wp.pi * (wp.float32(k) / wp.static(float(PROBE_RAYS - 1)) + turn)
             if count > wp.static(PROBE_RAYS):
@@ -166,7 +166,7 @@ def make_visible_share(config: TraceConfig) -> wp.Function:
             on_disk = basis * wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), sample.distance)
             distance = wp.length(on_disk)
             direction = on_disk / distance
-            # What lies below the surface that receives the light is hidden by that surface.
+            # Parts of the disk below the surface's horizon are hidden.
             if wp.dot(direction, geometric_normal) > 0.0:
                 origin = offset_origin(point, geometric_normal, direction, error)
                 if not occluded(scene, origin, direction, distance - 2.0 * error):

@@ -1,7 +1,7 @@
-"""Primary rays: which object and which proxy each pixel of a frame shows, and where its samples look.
+"""Primary rays: the object and the proxy that each pixel of a frame shows, and the rays of samples within a pixel.
 
-``trace_pixels`` writes the objects that pixels show. Stages that ask for more per pixel use ``make_visible_proxy`` (the
-surface) and ``make_sample_direction`` (samples within a pixel). ``kernels/rays/trace.py`` walks the scene.
+``trace_pixels`` writes the objects that pixels show. Other stages use ``make_visible_proxy`` for the proxy in a pixel,
+and ``make_sample_direction`` for samples within a pixel. ``kernels/rays/trace.py`` intersects rays with the scene.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def make_primary(config: TraceConfig) -> wp.Function:
         hit = closest_object(scene, origin, direction, FAR)
         if wp.static(len(config.proxies) > 0):
             if hit.shape >= 0:
-                # Where object and proxy touch, the object is seen: both depths carry a few roundings.
+                # Where object and proxy touch, the object is visible: both depths have rounding errors.
                 if occluded_by_proxies(scene, origin, direction, hit.t * (1.0 - 16.0 * ROUNDING)):
                     hit.shape = -1
         return hit
@@ -56,7 +56,7 @@ def make_primary(config: TraceConfig) -> wp.Function:
 def make_visible_proxy(config: TraceConfig) -> wp.Function:
     """``visible_proxy(params, ray, scene, probes) -> Hit``: the proxy that a pixel shows, or shape -1.
 
-    A face that is seen from behind, or a mirror ball before it, is not what the camera sees of it.
+    A proxy that is seen from behind, or hidden by a mirror ball, does not count.
     """
     closest_proxy = make_trace(config).closest_proxy
 
@@ -99,7 +99,7 @@ def look_within_pixel(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.in
 
 @functools.cache
 def make_sample_direction(count: int) -> wp.Function:
-    """``sample_direction(params, ray, sample) -> vec3``: where a pixel's sample looks in the world, not unit.
+    """``sample_direction(params, ray, sample) -> vec3``: direction of a pixel's sample in the world, not unit.
 
     Args:
         count: Samples of a pixel, a square number; the only one is at the centre.
@@ -114,7 +114,7 @@ def make_sample_direction(count: int) -> wp.Function:
 
 
 def make_visible(objects: wp.array, hits: wp.array) -> VisibleObjects:
-    """The arrays of ``trace_pixels`` together."""
+    """Return ``VisibleObjects`` of these arrays."""
     visible = VisibleObjects()
     visible.objects, visible.hits = objects, hits
     return visible
@@ -155,8 +155,8 @@ trace_pixels = row_launcher(make_trace_pixels_kernel, like=lambda params, rays, 
 
 Args:
     config: Kinds of shape in ``scene``.
-    params: Frame values: camera and object_rect.
+    params: (1,) FrameParams: camera and object_rect.
     rays: (H, W) undistorted x / z and y / z of each pixel centre.
-    scene: What rays meet.
-    visible_out: (H, W) the objects and hits.
+    scene: Objects and proxies.
+    visible_out: (H, W) objects and hits.
 """

@@ -1,11 +1,11 @@
-"""One path through the local scene: the light that arrives at its surfaces, and where it goes on.
+"""One path through the local scene: the light that arrives at its surfaces, and its next ray.
 
-A path goes round one loop (``path_tracer``): what its ray meets (``meet``), then what happens at the surface
-(``visit``). There light that arrives straight from the environment (a direction drawn by its light) and from every
-virtual light is added, and it goes on in a direction drawn by the surface (see ``path_sampling``). Both ways to reach
-the environment are combined by their densities, and so are both ways to reach the disk of a virtual light. A path ends
-by Russian roulette, with a chance that its throughput makes up for. Nothing is clamped: the mean over paths has no
-error but noise.
+The loop of a path (``path_tracer``) alternates between ``meet``, for the surface that its ray meets, and ``visit``, for
+scattering at that surface. There direct light is added, from the environment (in a direction drawn by its light) and
+from every virtual light. The path continues in a direction drawn by the surface (see ``path_sampling``). Both ways to
+reach the environment are combined by their densities (multiple importance sampling), and so are both ways to reach the
+disk of a virtual light. Paths end by Russian roulette, which the throughput makes up for. Nothing is clamped, so the
+mean over paths is unbiased.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
@@ -58,23 +58,23 @@ from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Hit
 wp.set_module_options({"enable_backward": False})
 
 MOST_VERTICES = wp.constant(64)
-"""Surfaces on a path at most; between mirrors alone nothing else ends it."""
+"""Largest number of surfaces on a path; ends paths between mirrors alone."""
 SURE_VERTICES = wp.constant(2)
-"""Surfaces before Russian roulette begins."""
+"""Number of surfaces before Russian roulette begins."""
 MOST_SURVIVAL = wp.constant(wp.float32(0.95))
-"""Chance to go on, at most."""
+"""Largest probability to continue a path."""
 PICK = wp.constant(0)
 SCATTER = wp.constant(1)
 SKY = wp.constant(2)
 CHOICE = wp.constant(3)
 FIRST_LIGHT = wp.constant(4)
-"""Streams of random numbers at a vertex; each virtual light has its own, as far as they go."""
+"""First stream of random numbers for virtual lights at a vertex; each light has its own while streams last."""
 
 CANDIDATES = wp.constant(4)
 """Directions toward the environment's light at a first surface, of which one is followed."""
 GOLDEN = wp.constant(wp.float32(0.61803399))
 SILVER = wp.constant(wp.float32(0.41421356))
-"""Steps between candidates, which spread them evenly."""
+"""Step of the random number between candidates, which spreads them evenly."""
 MOST_RANDOM = wp.constant(wp.float32(0.99999994))
 """Largest random number below 1."""
 
@@ -94,43 +94,43 @@ class PathState:
     density: wp.float32  # with which the direction was drawn
     depth: wp.int32
     changes_only: wp.bool  # whether it carries the difference that virtual content makes
-    without: wp.bool  # whether it meets no virtual content
-    without_near: wp.bool  # whether light straight from near emitters is no part of what its ray brings
+    without: wp.bool  # whether virtual content does not exist for it
+    without_near: wp.bool  # whether direct light of near emitters on its ray is left out
 
 
 @wp.struct
 class PathPair:
-    """A path from the camera, and the one without virtual content for which it waits at times."""
+    """A path from the camera, and a side path without virtual content, for which the main path may wait."""
 
-    path: PathState  # the one that is followed
-    waiting: PathState  # while ``path`` is the one without virtual content
-    physical: wp.vec3  # what the one without brings
-    is_known: wp.bool  # whether it is of the ray on which ``path`` is
+    path: PathState  # the path that is followed at present
+    waiting: PathState  # the main path, while ``path`` is the side path
+    physical: wp.vec3  # radiance that the side path found
+    is_known: wp.bool  # whether ``physical`` is the radiance along the ray of ``path``
     next: wp.int32  # SURFACE, RAY or ENDED
-    white: wp.bool  # whether the first surface is white, and what it sends without virtual content is asked for too
-    lobe: wp.bool  # whether it is not white but the gloss of its proxy alone
-    glossy: wp.bool  # whether there is one of either kind
-    only_light: wp.bool  # whether nothing else is asked for
-    radiance: wp.vec3  # that it brings to the camera, or the difference that virtual content makes
-    light: wp.vec3  # what the white surface would send without virtual content
-    rays: wp.int32  # that were traced for it
+    white: wp.bool  # whether the first surface is replaced by a white one (or its lobe), and ``light`` is computed
+    lobe: wp.bool  # whether the first surface is replaced by its proxy's specular lobe instead
+    glossy: wp.bool  # whether the first surface needs both paths, with a white surface and with the lobe
+    only_light: wp.bool  # whether ``light`` alone is needed
+    radiance: wp.vec3  # radiance toward the camera, or the difference that virtual content makes
+    light: wp.vec3  # radiance of the replaced first surface without virtual content
+    rays: wp.int32  # number of rays traced
 
 
 @wp.struct
 class DirectionSample:
-    """A direction at a surface: toward light, or in which the path goes on."""
+    """A direction drawn at a surface: toward light, or for the next ray."""
 
     direction: wp.vec3  # unit; zero where there is none
-    density: wp.float32  # per steradian; NO_DENSITY where no other way draws it
-    times: wp.float32  # that density is that of so many candidates together
-    distance: wp.float32  # of what sends light
+    density: wp.float32  # per steradian; NO_DENSITY if no other strategy can draw it
+    times: wp.float32  # number of candidates of that density
+    distance: wp.float32  # of the light's source
     radiance: wp.vec3  # from there, or the irradiance of a surface that faces the light
-    per: wp.float32  # that this is divided by: the density, or 1
+    per: wp.float32  # divisor of ``radiance``: the density, or 1
 
 
 @wp.func
 def draw_next(hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, key: PathKey) -> wp.vec3:
-    """Draw the direction in which a path goes on; zero where it leads into the surface."""
+    """Draw the direction of a path's next ray; zero if it leads into the surface."""
     u = random_triple(key, path.depth, SCATTER)
     pick = random_triple(key, path.depth, PICK)
     return draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
@@ -138,7 +138,7 @@ def draw_next(hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, key: Pat
 
 @wp.func
 def survival(throughput: wp.vec3, vertices: wp.int32) -> wp.float32:
-    """Chance of a path to go on after so many surfaces."""
+    """Return the probability that a path continues after ``vertices`` surfaces."""
     if vertices < SURE_VERTICES:
         return 1.0
     return wp.min(wp.max(throughput), MOST_SURVIVAL)
@@ -148,13 +148,13 @@ def survival(throughput: wp.vec3, vertices: wp.int32) -> wp.float32:
 def light_along(
     sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, density: wp.float32, without_near: wp.bool
 ) -> wp.vec3:
-    """The environment's light on a ray to ``vertex`` that was drawn with ``density``: its share beside ``draw_sky``."""
+    """Return the environment's light on a ray to ``vertex``, drawn with ``density``, weighted against ``draw_sky``."""
     light = wp.vec3(0.0, 0.0, 0.0)
     own = density
     if not without_near:
         light = near_radiance(sky, origin, direction, vertex.hit.t, density)
     else:
-        own = density * (1.0 - sky.near_share)  # as only the distant environment is drawn
+        own = density * (1.0 - sky.near_share)  # because only the distant environment is drawn
     if vertex.kind == NOTHING:
         light += sky_radiance(sky, direction, own)
     return light
@@ -162,13 +162,13 @@ def light_along(
 
 @wp.func
 def wrap(u: wp.float32) -> wp.float32:
-    """A number's part from 0 to below 1."""
+    """Return the fractional part of a number, from 0 to below 1."""
     return wp.min(u - wp.floor(u), MOST_RANDOM)
 
 
 @wp.func
 def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """Return a surface's reflection of light from ``wi``, with the cosine; a mirror's reflectance; 0 from below."""
+    """Return the BRDF times cosine for light from ``wi``; for a mirror its reflectance; 0 from below."""
     reflected = wp.vec3(0.0, 0.0, 0.0)
     if wp.dot(hit.geometric_normal, wi) > 0.0:
         reflected = surface.reflectance
@@ -177,14 +177,14 @@ def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.v
     return reflected
 
 
-# Light of the environment is drawn by how bright it is, not by what the surface makes of it or by where it faces. At a
-# first surface, where most of a picture's noise begins, several directions are therefore drawn, and one of them is
-# chosen by what the surface would reflect of it [Tal05]. With w_k what candidate k would reflect over the density with
-# which it was drawn, the one that is chosen counts with the mean of all w over its own, whatever the candidates have to
-# do with each other: each alone is drawn as it should be. So they are spread evenly from one random start.
+# Directions toward the environment are drawn by its brightness, not by the surface's reflection or orientation. At a
+# first surface, where most of a picture's noise arises, several candidates are therefore drawn, and one of them is
+# chosen by the light that the surface would reflect [Tal05]. With w_k the reflected light of candidate k over its
+# density, the chosen candidate has the weight (mean of all w) / (its own w). This holds even for dependent candidates,
+# because each alone has the right density. So they are spread evenly from one random start.
 @wp.func
 def candidate_value(surface: Surface, hit: Hit, wo: wp.vec3, sky: SkyLight, times: wp.float32) -> wp.float32:
-    """Return a surface's reflection of light along a candidate, by its share beside what the surface draws itself."""
+    """Return the light of a candidate that a surface reflects, weighted against directions drawn by the surface."""
     value = brightness(wp.cw_mul(reflected_from(surface, hit, wo, sky.direction), sky.radiance))
     if value > 0.0:
         value *= balance(times * sky.density, surface_density(surface, hit.normal, wo, sky.direction))
@@ -195,7 +195,7 @@ def candidate_value(surface: Surface, hit: Hit, wo: wp.vec3, sky: SkyLight, time
 def draw_toward_sky(
     scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, path: PathState, without_near: wp.bool, key: PathKey
 ) -> DirectionSample:
-    """A direction toward light of the environment, the distant one alone if ``without_near``; zero where none is."""
+    """Draw a direction toward the environment's light, only the distant one if ``without_near``; zero for none."""
     out = DirectionSample()
     u = random_triple(key, path.depth, SKY)
     near_share = wp.where(without_near, scene.sky.near_share, 0.0)
@@ -247,7 +247,7 @@ def draw_toward_light(
     without_near: wp.bool,
     key: PathKey,
 ) -> DirectionSample:
-    """A direction toward virtual light number ``light``, or toward light of the environment where that is -1."""
+    """Draw a direction toward virtual light number ``light``, or toward the environment's light if that is -1."""
     if light < 0:
         return draw_toward_sky(scene, hit, surface, wo, path, without_near, key)
     out = DirectionSample()
@@ -261,7 +261,7 @@ def draw_toward_light(
             cosine = sample.distance / away[3]
             radius = scene.lights[light].radius
             out.density = away[3] * away[3] / (wp.pi * radius * radius * cosine)
-        # Short of the light, so that a light on a surface is not hidden by that surface.
+        # Shortened, so that a light on a surface is not hidden by that surface.
         out.distance = away[3] - 2.0 * hit.error
         out.radiance = sample.irradiance_normal
         out.times = 1.0
@@ -279,7 +279,7 @@ def extend_path(
     without_near: wp.bool,
     key: PathKey,
 ) -> PathState:
-    """The path on its next ray, drawn with ``density`` (NO_DENSITY: a mirror's); without throughput where it ends."""
+    """Put a path on its next ray, drawn with ``density`` (NO_DENSITY for a mirror); its throughput is 0 if it ends."""
     following = path
     share = wp.vec3(0.0, 0.0, 0.0)
     if density > 0.0:
@@ -302,7 +302,7 @@ def extend_path(
 
 @wp.func
 def bring(pair: PathPair, radiance: wp.vec3) -> PathPair:
-    """Radiance that the path which is followed meets where it is."""
+    """Add radiance at the end of the followed path, times its throughput, to the result."""
     out = pair
     if pair.path.without:
         out.physical += wp.cw_mul(pair.path.throughput, radiance)
@@ -313,7 +313,7 @@ def bring(pair: PathPair, radiance: wp.vec3) -> PathPair:
 
 @wp.func
 def begin_without(pair: PathPair) -> PathPair:
-    """The path waits for one that leaves virtual content out, which starts on the ray on which it is."""
+    """Let the path wait, and start a side path without virtual content on the same ray."""
     out = pair
     out.waiting = pair.path
     out.physical = wp.vec3(0.0, 0.0, 0.0)
@@ -325,7 +325,7 @@ def begin_without(pair: PathPair) -> PathPair:
 
 @wp.func
 def end_without(pair: PathPair) -> PathPair:
-    """The path goes on that waited for one without virtual content."""
+    """End the side path without virtual content, and continue the main path that waited for it."""
     out = pair
     out.path = pair.waiting
     out.is_known = True
@@ -337,17 +337,17 @@ def end_without(pair: PathPair) -> PathPair:
 
 @wp.struct
 class SeenProxy:
-    """Observation of a point of a proxy in the frame."""
+    """Radiance and reflectance of a proxy's point, from the frame if it shows the point."""
 
     reflectance: wp.vec3
-    shows: wp.bool  # whether what the camera sees of it is what it sends everywhere
-    radiance: wp.vec3  # that it has without virtual content, if the frame shows it
-    rays: wp.int32  # that were traced for it
+    shows: wp.bool  # whether its radiance is known from the frame and the same in all directions
+    radiance: wp.vec3  # without virtual content, if the frame shows it
+    rays: wp.int32  # number of rays traced to find them
 
 
 @functools.cache
 def make_see_proxy(trace: TraceConfig) -> wp.Function:
-    """``see_proxy(params, scene, vertex) -> SeenProxy``."""
+    """``see_proxy(params, scene, vertex) -> SeenProxy``: radiance and reflectance of a proxy's point."""
     see_in_frame = make_see_in_frame(trace)
 
     @wp.func(module="unique")
@@ -359,7 +359,7 @@ def make_see_proxy(trace: TraceConfig) -> wp.Function:
         out.reflectance = scene.proxy_reflectance[vertex.hit.shape]
         if seen.known:
             out.reflectance = seen.reflectance
-            # What a glossy surface sends the camera is not what it sends elsewhere.
+            # The radiance of a glossy surface toward the camera differs from that in other directions.
             out.shows = not is_glossy(scene, vertex)
         return out
 
@@ -368,7 +368,7 @@ def make_see_proxy(trace: TraceConfig) -> wp.Function:
 
 @wp.func
 def white_surface(scene: LocalScene, vertex: Vertex, lobe: wp.bool) -> Surface:
-    """A first surface that tells how much light arrives: white, or the gloss of its proxy alone."""
+    """Return the surface that replaces a first surface to measure arriving light: white, or its proxy's lobe alone."""
     surface = Surface()
     if lobe:
         surface = polished(scene, vertex, wp.vec3(0.0, 0.0, 0.0))
@@ -380,10 +380,10 @@ def white_surface(scene: LocalScene, vertex: Vertex, lobe: wp.bool) -> Surface:
 
 @wp.struct
 class DirectLight:
-    """Light that reaches a surface straight from its sources, as the surface reflects it."""
+    """Reflected direct light at a surface."""
 
     of_sky: wp.vec3  # of the environment, without virtual content
-    changed: wp.vec3  # of the environment as virtual content leaves it, or its change, and the surface's own light
+    changed: wp.vec3  # of the environment with virtual content, or its change, plus light that the surface emits
     of_lights: wp.vec3  # of virtual lights
 
 
@@ -391,7 +391,7 @@ class DirectLight:
 def add_direct(
     direct: DirectLight, arriving: wp.vec3, is_sky: wp.bool, hidden: wp.bool, path: PathState, with_virtual: wp.bool
 ) -> DirectLight:
-    """One source more: the environment or a virtual light, nothing physical in the way; ``hidden`` by an object."""
+    """Add light of the environment or a virtual light that no physical surface hides; ``hidden`` by a virtual one."""
     out = direct
     if is_sky:
         out.of_sky = arriving
@@ -406,13 +406,13 @@ def add_direct(
 
 @wp.func
 def is_first_white(pair: PathPair) -> wp.bool:
-    """Return whether a path is at the first surface of a pixel that tells how much light arrives."""
+    """Return whether a path is at a first surface that is replaced to measure arriving light."""
     return pair.white and pair.path.depth == 0
 
 
 @wp.func
 def bring_direct(pair: PathPair, direct: DirectLight) -> PathPair:
-    """Return the part of it that the followed path asks for."""
+    """Add the part of direct light that the followed path carries."""
     if pair.path.without:
         return bring(pair, direct.of_sky)
     out = bring(pair, direct.changed + direct.of_lights)
@@ -423,21 +423,21 @@ def bring_direct(pair: PathPair, direct: DirectLight) -> PathPair:
 
 @wp.func
 def with_virtual_content(pair: PathPair) -> wp.bool:
-    """Return whether the path that is followed meets virtual lights and what objects send."""
+    """Return whether the followed path includes virtual lights and light of virtual objects."""
     return not (pair.only_light or pair.path.without)
 
 
 @wp.func
 def is_polished(kind: wp.int32, surface: Surface) -> wp.bool:
-    """Return whether a surface throws light by a lobe that paths from the camera rarely meet."""
+    """Return whether a surface has a narrow lobe, whose caustics paths from the camera rarely find."""
     matt = surface.model == wp.static(int(LAMBERT)) or surface.model == wp.static(int(MIRROR))
     return kind == OBJECT and not matt
 
 
 @wp.func
 def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.int32:
-    """Return the number of virtual lights that the followed path asks for at its surface: all, or none."""
-    # What they send a white surface by way of a polished one is followed from the lights (``path_photons``).
+    """Return the number of virtual lights that the followed path samples at its surface: all, or none."""
+    # Their light on a white surface by way of a polished one is found by paths from the lights (``path_photons``).
     followed = scene.lights_followed and pair.white and not pair.lobe and pair.path.depth > 0
     if (followed and is_polished(kind, surface)) or not with_virtual_content(pair):
         return 0
@@ -446,14 +446,14 @@ def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPai
 
 @wp.func
 def are_near_followed(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.bool:
-    """Return whether light of near emitters at a surface is followed from them (``path_photons``)."""
+    """Return whether paths from near emitters find their light at a surface (``path_photons``)."""
     asked = scene.near_followed and pair.white and not pair.lobe and pair.path.depth > 0
     return asked and is_polished(kind, surface)
 
 
 @wp.func
 def leave_surface(pair: PathPair, direct: DirectLight, following: PathState) -> PathPair:
-    """The path goes from a surface to its next ray, with the light that the surface reflects of what reaches it."""
+    """Add direct light at a surface, and put the path on its next ray."""
     out = bring_direct(pair, direct)
     out.path = following
     out.path.changes_only = pair.path.changes_only
@@ -464,16 +464,16 @@ def leave_surface(pair: PathPair, direct: DirectLight, following: PathState) -> 
     return out
 
 
-# At a surface there are several directions: one toward the environment's light, one toward each virtual light, and that
-# in which the path goes on. Each is drawn in its own way. What the surface reflects of it, what is in the way, and with
-# which density it would have been drawn otherwise are found for one after another by the same code: a copy for each
-# would make the kernel larger, and NVRTC slower.
+# At a surface several directions are drawn: one toward the environment's light, one toward each virtual light, and that
+# of the next ray. Each has its own way of drawing. Reflection, occlusion and the density of the other strategy are
+# computed for one after another by the same code: a copy for each would make the kernel larger, and NVRTC slower.
 @functools.cache
 def make_scatter(trace: TraceConfig) -> wp.Function:
-    """``scatter(scene, kind, hit, surface, pair, key) -> PathPair``: light straight from its sources, and the next ray.
+    """``scatter(scene, kind, hit, surface, pair, key) -> PathPair``: add direct light, and draw the next ray.
 
-    No such light at mirrors. Of a difference it is what virtual content changes of it. The two ways to draw a direction
-    to the environment, or to the disk of a light, are combined by the balance heuristic.
+    Mirrors get no direct light. A path that carries a difference gets the change of direct light by virtual content.
+    The two ways to draw a direction to the environment, or to the disk of a light, are combined by the balance
+    heuristic.
     """
     hidden_by_physical = make_hidden_by_physical(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
@@ -525,23 +525,22 @@ def make_scatter(trace: TraceConfig) -> wp.Function:
     return scatter
 
 
-# The frame. The camera has seen the physical surfaces, so a path that meets a proxy where the frame shows it knows the
-# radiance L0 that it has without anything virtual. What virtual content (objects and lights) changes there is [Deb98]
+# The frame. If a path meets a proxy's point that the frame shows, its radiance L0 without virtual content is known.
+# With virtual content (objects and lights) it is [Deb98]
 #
 #     L = L0 + (L_with - L_without),    both by the same random numbers.
 #
-# A path is therefore in one of two states. While *whole* it carries radiance; where it meets such a point it takes L0
-# and goes on as a *difference*. A difference adds nothing as long as what it meets would be there without virtual
-# content as well: it takes away light of the environment that virtual objects hide, adds that of virtual lights, and
-# where it meets a virtual object it becomes whole, less the radiance that the same ray brings without objects. Of a
-# pixel that nothing virtual reaches, every path gives exactly 0.
+# A path is therefore in one of two states. While *whole* it carries radiance. At such a point it adds L0 and continues
+# as a *difference*. A difference subtracts light of the environment that virtual objects hide, and adds that of virtual
+# lights. Where it meets a virtual object it becomes whole again, and the radiance of the same ray without objects is
+# subtracted. In a pixel that virtual content does not affect, every path gives exactly 0.
 #
-# That radiance is found by a path of its own, for which the other waits and which meets nothing virtual. Both go round
-# the same loop: threads of a warp do the same whichever of the two they follow, and what a path does at a surface
+# The radiance of the ray without objects is found by a side path, which meets no virtual content, while the main path
+# waits. Both use the same loop, so that threads of a warp execute the same code for either, and the code for a surface
 # is compiled once.
 @wp.func
 def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
-    """Return the light that a ray from a surface finds at ``vertex``, and whether its path goes on."""
+    """Add the light that a ray from a surface finds at ``vertex``, and set the path's next step."""
     out = pair
     out.next = SURFACE
     path = pair.path
@@ -557,7 +556,7 @@ def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
             out.path.changes_only = False
         out.is_known = False
     if not out.path.changes_only:
-        # As a first surface draws candidates, their density is so many times as large.
+        # A first surface draws several candidates, so their total density is larger by that factor.
         density = path.density
         if path.depth == 1 and density > 0.0:
             density = density / wp.float32(CANDIDATES)
@@ -569,7 +568,7 @@ def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
 
 @wp.func
 def take_seen(pair: PathPair, seen: SeenProxy) -> PathPair:
-    """Return the frame's observation of the proxy on which a path is: it ends there if nothing virtual is asked for."""
+    """Add the frame's radiance of the proxy at which a path is; a path without virtual content ends there."""
     out = pair
     out.rays += seen.rays
     if seen.shows and not pair.path.changes_only:
@@ -583,7 +582,7 @@ def take_seen(pair: PathPair, seen: SeenProxy) -> PathPair:
 
 @functools.cache
 def make_visit(trace: TraceConfig) -> wp.Function:
-    """``visit(params, scene, vertex, pair, key) -> PathPair``: what happens at the surface on which a path is."""
+    """``visit(params, scene, vertex, pair, key) -> PathPair``: scattering of a path at the surface that it met."""
     scatter, see_proxy, look_up_material = make_scatter(trace), make_see_proxy(trace), make_look_up_material()
 
     @wp.func(module="unique")

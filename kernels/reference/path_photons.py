@@ -1,29 +1,29 @@
-"""Light of virtual lights that reaches the desk by way of other surfaces, followed from the lights.
+"""Caustics of virtual lights on the receiver, by paths that start at the lights.
 
-What polished metal throws of a lamp onto a matt surface comes by few directions, which a path from the camera finds by
-chance. A path from the lamp cannot miss them: it meets the metal, goes on as the metal reflects, and wherever it then
-meets a proxy that the camera sees, it adds to the pixel there [Arv86], [PBRT]. So the white surfaces of
-``path_picture`` leave out virtual lights at polished objects (``lights_at``), and have from here what they would have
-summed, by paths that meet such an object first: with W the power that a path from a light has as it meets a white
-surface at distance r and depth z from the camera, under the cosines c and c' of the surface toward camera and light, s'
-that of the normal for shading,
+Polished metal reflects a lamp's light to a matt surface from few directions, which a path from the camera finds only by
+chance. A path from the lamp meets the metal, is reflected, and where it then meets a proxy that the camera sees, it
+adds its light to that pixel [Arv86], [PBRT]. So paths from the white surfaces of ``path_picture`` omit virtual lights
+at polished objects (``lights_at``), and the light is added here, by paths that meet such an object first. A path meets
+a white surface with the power W, at distance r and depth z from the camera. c and c' are the cosines of the geometric
+normal toward camera and light, s' that of the shading normal toward the light. The pixel then has the additional
+radiance
 
-    L = 1 / N  sum over N paths of  W / pi  s' / c'  c r / z^3  fx fy
+    L = 1 / N  sum over N paths of  W / pi  s' / c'  c r / z^3  fx fy,
 
-is what a pixel has more, for a pixel is as large as r^3 / (z^3 c) of the surface's area over r^2, times fx fy.
+because a pixel covers the area z^3 / (c r fx fy) of the surface.
 
-At each surface a direction d is drawn as a path from the camera would draw it (density q); what the surface reflects
-toward d of light from l is what such a path would find there, so both ways have the same mean, whatever the normal for
-shading is. With V this reflected radiance over the irradiance of what faces l,
+At each surface a direction d is drawn as by a path from the camera (density q). The surface reflects light from l
+toward d as such a path would find it, so both methods have the same mean, for any shading normal. With V the reflected
+radiance over the irradiance of a surface that faces l,
 
     W  ->  W V cos(d) / (q cos(l)),    cosines with the geometric normal.
 
-Light of near emitters of the environment is followed likewise, from points of the spheres on which they lie. As they
-shine evenly to all sides, a point that is drawn with the density p per steradian around the sphere's centre, seen from
-there with the radiance L, is a light of the intensity L D^2 / p, D the sphere's radius.
+Light of near emitters of the environment is followed in the same way, from points of the spheres on which they lie.
+They have the same intensity in all directions: a point that is drawn with the density p per steradian around the
+sphere's centre, and has the radiance L from there, is a light of the intensity L D^2 / p, D the sphere's radius.
 
-Lights with a disk and directional ones are left to paths from the camera. So is light by which mirrors show a lamp that
-has no size, which these do not find.
+Lights with a disk and directional lights are left to paths from the camera. Neither kind of path finds the image of a
+light without size in a mirror.
 
 Sums are integers: threads may add to them in any order.
 
@@ -81,14 +81,14 @@ from warp_ar.kernels.structs import DIRECTIONAL, LAMBERT, MIRROR, SPHERE, FrameP
 wp.set_module_options({"enable_backward": False})
 
 BESIDE_PIXELS = wp.constant(wp.uint32(0x80000000))
-"""Added to a path's number, so that its random numbers are no pixel's."""
+"""Offset of a path's index, so that it does not share the random numbers of a pixel."""
 START = wp.constant(2)
 ON_EMITTER = wp.constant(3)
-"""Streams of random numbers by which a path starts."""
+"""Stream of random numbers that draws the start of a path on an emitter."""
 UNIT = wp.constant(wp.float32(16777216.0))
 """Fixed-point unit of the sums."""
 MOST = wp.constant(wp.float32(8192.0))
-"""That a path adds at most: of its own pixel's radiance, were it the only one of a pass."""
+"""Largest contribution of a path, as radiance of its pixel if it were the only path of a pass."""
 LEAST_VERSINE = wp.constant(wp.float32(1.0e-6))
 """Least versine of the cone toward an object: a half angle of 0.08 degrees."""
 COUNTERS = 1024
@@ -97,11 +97,11 @@ COUNTERS = 1024
 
 @wp.struct
 class LightImage:
-    """Light that paths from virtual lights brought to pixels, sums over all of them."""
+    """Light of paths from virtual lights, summed per pixel."""
 
     sums: wp.array[wp.int64]  # (H W 3) radiance times the number of paths of a pass, over the number of pixels
-    squares: wp.array[wp.int64]  # (H W 3) of the same
-    rays: wp.array[wp.int64]  # (COUNTERS) that were traced
+    squares: wp.array[wp.int64]  # (H W 3) sums of squares of the same
+    rays: wp.array[wp.int64]  # (COUNTERS) partial counts of traced rays
 
 
 @wp.func_native("""
@@ -112,7 +112,7 @@ class LightImage:
 #endif
 """)
 def add_whole(sums: wp.array[wp.int64], index: wp.int32, value: wp.int64):
-    """Add to a sum to which other threads add as well, on every device."""
+    """Add to a sum atomically, on every device."""
 
 
 def is_polished_one(objects: npt.NDArray[np.void], materials: npt.NDArray[np.void]) -> bool:
@@ -129,7 +129,7 @@ def is_polished_one(objects: npt.NDArray[np.void], materials: npt.NDArray[np.voi
 def follows_lights(
     lights: npt.NDArray[np.void], objects: npt.NDArray[np.void], materials: npt.NDArray[np.void]
 ) -> bool:
-    """Return whether light of virtual lights is followed from them: of all, which have a place and no size, or of none.
+    """Return whether paths start at virtual lights: if all have a position and no size, and an object is polished.
 
     Args:
         lights: Records of ``structs.Light``.
@@ -144,7 +144,7 @@ def spheres_around(objects: npt.NDArray[np.void]) -> npt.NDArray[np.float32]:
     """Return centre and radius of a sphere around each object, (n, 4).
 
     Args:
-        objects: Records of ``structs.Shape`` where they stand.
+        objects: Records of ``structs.Shape`` at their current poses.
     """
     radius = np.where(objects["kind"] == SPHERE, objects["extent"][:, 0], np.linalg.norm(objects["extent"], axis=1))
     return np.concatenate([objects["position"], (objects["scale"] * radius)[:, None]], axis=1).astype(np.float32)
@@ -164,14 +164,14 @@ def cone_versine(sphere: wp.vec4, point: wp.vec3) -> wp.float32:
 
 @wp.func
 def versine_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
-    """1 - cosine between unit vectors, without its cancellation."""
+    """Return 1 - cosine between unit vectors, without cancellation."""
     off = a - b
     return 0.5 * wp.dot(off, off)
 
 
 @wp.func
 def draw_in_cone(axis: wp.vec3, most: wp.float32, u: wp.vec2) -> wp.vec3:
-    """Direction even in a cone, by 1 - cosine of its half angle."""
+    """Draw a uniform direction in a cone; ``most`` is 1 - cosine of its half angle."""
     versine = u[0] * most
     sine = wp.sqrt(wp.max(versine * (2.0 - versine), 0.0))
     phi = 2.0 * wp.pi * u[1]
@@ -180,7 +180,7 @@ def draw_in_cone(axis: wp.vec3, most: wp.float32, u: wp.vec2) -> wp.vec3:
 
 @wp.func
 def toward_sphere(sphere: wp.vec4, point: wp.vec3) -> wp.vec3:
-    """Direction to a sphere's centre."""
+    """Return the unit direction to a sphere's centre."""
     away = wp.vec3(sphere[0], sphere[1], sphere[2]) - point
     if wp.dot(away, away) > 0.0:
         return wp.normalize(away)
@@ -189,7 +189,7 @@ def toward_sphere(sphere: wp.vec4, point: wp.vec3) -> wp.vec3:
 
 @wp.func
 def draw_start(scene: LocalScene, at: wp.vec3, u: wp.vec3) -> wp.vec3:
-    """Direction in which a path leaves a light: toward a virtual object."""
+    """Draw the direction in which a path leaves a light: toward a virtual object."""
     count = scene.spheres.shape[0]
     k = wp.min(wp.int32(u[2] * wp.float32(count)), count - 1)
     sphere = scene.spheres[k]
@@ -198,7 +198,7 @@ def draw_start(scene: LocalScene, at: wp.vec3, u: wp.vec3) -> wp.vec3:
 
 @wp.func
 def start_density(scene: LocalScene, at: wp.vec3, direction: wp.vec3) -> wp.float32:
-    """Density with which ``draw_start`` gives a direction, per steradian."""
+    """Return the density of ``draw_start`` for a direction, per steradian."""
     density = float(0.0)
     count = scene.spheres.shape[0]
     for k in range(count):
@@ -219,7 +219,7 @@ class PointOfEmitter:
 
 @wp.func
 def draw_on_emitters(sky: Sky, u: wp.vec2) -> PointOfEmitter:
-    """A point of a near emitter, by its light as ``draw_sky`` has it."""
+    """Draw a point of a near emitter, in proportion to its light as in ``draw_sky``."""
     out = PointOfEmitter()
     height = sky.radiance.shape[0]
     width = sky.radiance.shape[1]
@@ -237,7 +237,7 @@ def draw_on_emitters(sky: Sky, u: wp.vec2) -> PointOfEmitter:
 
 @wp.func
 def seen_area(params: FrameParams, vertex: Vertex, toward_light: wp.vec3) -> wp.float32:
-    """Radiance of a white surface in the one pixel that sees a path with the power 1 meet it; 0 if that faces away."""
+    """Return the radiance that a path of power 1 adds to the pixel that shows its white surface; 0 if it faces away."""
     away = vertex.hit.point - params.camera_position
     distance = wp.length(away)
     view = away / wp.max(distance, 1.0e-6)
@@ -256,7 +256,7 @@ def seen_area(params: FrameParams, vertex: Vertex, toward_light: wp.vec3) -> wp.
 def add_to_pixels(
     params: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, radiance: wp.vec3, image_out: LightImage
 ):
-    """Add to the pixel that sees a point: pixels are as large as the rays of ``camera_ray`` reach."""
+    """Add radiance to the pixel that shows a point; pixels have the extent of the rays of ``camera_ray``."""
     away = point - params.camera_position
     at = project(params, away)
     local = wp.transpose(params.world_from_camera) * away
@@ -298,7 +298,7 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
     ):
         k = wp.tid() + row_start
         key = PathKey()
-        # No pixel has such a number.
+        # An index that no pixel has.
         key.pixel = wp.uint32(k) + BESIDE_PIXELS
         key.sample = wp.uint32(number)
         key.seed = wp.uint32(seed)
@@ -387,7 +387,7 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
 
 
 def make_light_image(shape: tuple[int, int], device: wp.DeviceLike) -> LightImage:
-    """Sums of no paths, for a picture of (H, W) pixels."""
+    """Return the sums of no paths, for a picture of (H, W) pixels."""
     image = LightImage()
     size = 3 * shape[0] * shape[1]
     image.sums, image.squares = (wp.zeros(size, dtype=wp.int64, device=device) for _ in range(2))
@@ -396,15 +396,15 @@ def make_light_image(shape: tuple[int, int], device: wp.DeviceLike) -> LightImag
 
 
 follow_lights = row_launcher(make_follow_lights_kernel, like=lambda *given: given[5:6])
-"""Follow paths from virtual lights and near emitters, and add what pixels have of them.
+"""Follow paths from virtual lights and near emitters, and add their light to pixels.
 
 Args:
     trace: Kinds of shape in the scene.
     params: (1,) FrameParams: the camera.
-    scene: All that paths meet; its lights as ``follows_lights`` has them.
-    seed: Of the random numbers.
-    number: Of this pass, by which its random numbers are others than those of the passes before.
-    count: Paths, at most 2^31.
-    of_lights: How many of these, the first ones, are from virtual lights; the others are from near emitters.
-    image_out: Of ``make_light_image``.
+    scene: Surfaces and lights; for the lights ``follows_lights`` must hold.
+    seed: Seed of the random numbers.
+    number: Index of this pass, so that its random numbers differ from those of other passes.
+    count: Number of paths, at most 2^31.
+    of_lights: Number of the first paths, which start at virtual lights; the others start at near emitters.
+    image_out: From ``make_light_image``.
 """

@@ -1,12 +1,13 @@
-"""From samples to a picture: moments of a pixel's samples, the reflectance of what it shows, and its error.
+"""Picture of the path tracer, from samples: moments of each pixel, reflectance of its surface, and standard error.
 
-Per sample of a pixel there are three quantities: z, what needs no reflectance; g, the difference that virtual content
-makes on a white surface; and e = E / pi, what a white surface would send without virtual content.
+Each sample of a pixel has three quantities: z, radiance that does not depend on the proxy's reflectance; g, the
+difference that virtual content makes on a white surface; and e = E / pi, the radiance of a white surface without
+virtual content.
 
-A noisy pixel takes a hundred samples where another takes one. If a thread did all those of its pixel, a GPU would wait
-for a few of them with nearly all of it idle. So the samples of all pixels are listed, those of a pixel side by side;
-each is traced into a place of its own (``path_tracer.trace_paths``), and pixels then add theirs in order. Their moments
-have the same bits however a round is divided.
+A noisy pixel takes a hundred times the samples of another. If one thread traced all samples of its pixel, most of a GPU
+would wait for a few threads. So the samples of all pixels are listed, those of a pixel one after another. Each is
+traced by its own thread (``path_tracer.trace_paths``), and pixels then add their samples in order. So moments have the
+same bits however samples are divided into rounds.
 
     list_samples -> trace_paths -> add_samples
 
@@ -35,7 +36,7 @@ SMOOTHED = wp.constant(2)
 class Moments:
     """Means of samples per pixel, and sums of products of deviations from them, (H, W) each."""
 
-    fixed: wp.array2d[wp.vec3]  # z: what needs no reflectance
+    fixed: wp.array2d[wp.vec3]  # z
     change: wp.array2d[wp.vec3]  # g
     light: wp.array2d[wp.vec3]  # e
     proxies: wp.array2d[wp.float32]  # share of samples that show a proxy
@@ -45,8 +46,8 @@ class Moments:
     fixed_change: wp.array2d[wp.vec3]
     fixed_light: wp.array2d[wp.vec3]
     change_light: wp.array2d[wp.vec3]
-    rays: wp.array2d[wp.int32]  # traced so far
-    samples: wp.array2d[wp.int32]  # that these are of
+    rays: wp.array2d[wp.int32]  # number of rays traced so far
+    samples: wp.array2d[wp.int32]  # number of samples so far
 
 
 @wp.func
@@ -57,7 +58,7 @@ def sum_product(i: wp.int32, j: wp.int32, before: wp.vec3, after: wp.vec3, sums:
 
 @wp.func
 def add_sample(i: wp.int32, j: wp.int32, z: wp.vec3, g: wp.vec3, e: wp.vec3, shows: wp.float32, moments: Moments):
-    """Take one more sample of a pixel into its moments."""
+    """Add one sample of a pixel to its moments."""
     number = moments.samples[i, j] + 1
     moments.samples[i, j] = number
     count = wp.float32(number)
@@ -80,24 +81,24 @@ def add_sample(i: wp.int32, j: wp.int32, z: wp.vec3, g: wp.vec3, e: wp.vec3, sho
 
 @wp.struct
 class Round:
-    """Samples that are traced side by side: N of them, of H W pixels."""
+    """N samples of H W pixels that are traced in one launch."""
 
-    counts: wp.array[wp.int32]  # (H W) of each pixel
-    ends: wp.array[wp.int32]  # (H W) one past the last of each pixel
-    pixels: wp.array[wp.int32]  # (N) i W + j of each sample; this and all below may be longer
-    z: wp.array[wp.vec3]  # what it tells, as ``add_sample`` takes it
+    counts: wp.array[wp.int32]  # (H W) number of samples of each pixel
+    ends: wp.array[wp.int32]  # (H W) one past the last sample of each pixel
+    pixels: wp.array[wp.int32]  # (N) pixel i W + j of each sample; this array and those below may be longer
+    z: wp.array[wp.vec3]  # z, g, e and shows: quantities of each sample, for ``add_sample``
     g: wp.array[wp.vec3]
     e: wp.array[wp.vec3]
     shows: wp.array[wp.float32]
-    rays: wp.array[wp.int32]  # that were traced for it
+    rays: wp.array[wp.int32]  # number of rays traced for each sample
     count: wp.int32  # N
 
 
-# A pass adds ``share`` samples to a pixel: after n passes it has floor(n share + u), u its own number from 0 to 1. So
-# what a pixel has does not depend on how many passes are made at a time, and pixels of small shares take turns.
+# A pass adds ``share`` samples to a pixel on average: after n passes it has floor(n share + u), u a fixed random number
+# of the pixel, 0 to 1. So the count does not depend on how passes are grouped, and pixels of small shares alternate.
 @wp.func
 def samples_after(passes: wp.int32, share: wp.float32, bits: wp.uint32) -> wp.int32:
-    """Samples of a pixel after so many passes."""
+    """Return the number of samples of a pixel after so many passes."""
     return wp.int32(wp.floor(wp.float32(passes) * share + uniform_from_bits(bits)))
 
 
@@ -130,7 +131,7 @@ def list_samples_kernel(
     # Out:
     pixels_out: wp.array[wp.int32],
 ):
-    """Write each pixel's number as often as it takes samples."""
+    """Write each pixel's index once for each of its samples."""
     pixel = wp.tid() + row_start
     for k in range(ends[pixel] - counts[pixel], ends[pixel]):
         pixels_out[k] = pixel
@@ -144,7 +145,7 @@ def add_samples_kernel(
     # Out:
     moments_out: Moments,
 ):
-    """Take each pixel's samples into its moments, one after another."""
+    """Add each pixel's samples to its moments, one after another."""
     i, j = wp.tid()
     i += row_start
     pixel = i * moments_out.samples.shape[1] + j
@@ -155,7 +156,7 @@ def add_samples_kernel(
 
 
 def make_round(shape: tuple[int, int], device: wp.DeviceLike) -> Round:
-    """A round without samples, of (H, W) pixels."""
+    """Return a round without samples, of (H, W) pixels."""
     made = Round()
     made.counts = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
     made.ends = wp.zeros(shape[0] * shape[1], dtype=wp.int32, device=device)
@@ -164,7 +165,7 @@ def make_round(shape: tuple[int, int], device: wp.DeviceLike) -> Round:
 
 
 def _make_room(samples_out: Round, count: int) -> None:
-    """Arrays for so many samples."""
+    """Enlarge the arrays of a round for ``count`` samples, if they are too short."""
     device = samples_out.counts.device
     for name in ("z", "g", "e"):
         setattr(samples_out, name, wp.empty(count, dtype=wp.vec3, device=device))
@@ -177,11 +178,11 @@ def list_samples(shares: wp.array2d[wp.float32], samples_out: Round, *, seed: in
     """List the samples of some passes, and count them.
 
     Args:
-        shares: (H, W) samples of a pixel in a pass.
-        samples_out: Of ``make_round``; grows as it must.
-        seed: Of the random numbers.
-        begun: Passes with these shares that were made before.
-        count: Passes.
+        shares: (H, W) mean number of samples of each pixel in a pass.
+        samples_out: From ``make_round``; enlarged if needed.
+        seed: Seed of the random numbers.
+        begun: Number of earlier passes with these shares.
+        count: Number of passes.
     """
     device, counts, ends = shares.device, samples_out.counts, samples_out.ends
     inputs = [seed, begun, count, shares]
@@ -194,16 +195,16 @@ def list_samples(shares: wp.array2d[wp.float32], samples_out: Round, *, seed: in
 
 
 add_samples = row_launcher(add_samples_kernel, like=lambda samples, moments: moments.samples)
-"""Take the samples of a round into the moments of their pixels, (H, W)."""
+"""Add the samples of a round to the moments of their pixels, (H, W)."""
 
 
-# Reflectance of a proxy's point is pi L0 / E, E its irradiance without virtual content, gathered by the same paths:
-# light that arrives from the environment, and L0 of what else they meet. Deeper in a path, it is read from a map that
-# was made before, of E averaged over 5 x 5 pixels of one surface; of a point that no pixel shows it is the mean of its
-# proxy.
+# Reflectance of a proxy's point is pi L0 / E, with E its irradiance without virtual content. The same paths gather E:
+# light of the environment, and the radiance L0 of other surfaces. At later vertices of a path, reflectance is read from
+# a map made before, with E averaged over 5 x 5 pixels of one surface. A point that no pixel shows has the mean
+# reflectance of its proxy.
 @wp.func
 def reflectance_under(radiance: wp.vec3, light: wp.vec3) -> wp.vec3:
-    """Reflectance of what looks like ``radiance`` where a white surface would send ``light``."""
+    """Return the reflectance of a surface of radiance ``radiance``, if a white one would have ``light``."""
     return wp.vec3(
         reflectance_of(radiance[0], wp.pi * light[0]),
         reflectance_of(radiance[1], wp.pi * light[1]),
@@ -226,9 +227,10 @@ def map_reflectance_kernel(
     matt_out: wp.array2d[wp.vec3],
     reflectance_out: wp.array2d[wp.vec3],
 ):
-    """Reflectance of every pixel that shows a proxy, from light averaged over its neighbours on the same one.
+    """Write the reflectance of a pixel that shows a proxy, by light averaged over neighbours on the same proxy.
 
-    What a glossy proxy mirrors there, averaged likewise, is no part of it; ``matt_out`` may be empty where none is.
+    The specular reflection of a glossy proxy, averaged in the same way, is subtracted from the frame before;
+    ``matt_out`` may be empty if no proxy is glossy.
     """
     i, j = wp.tid()
     i += row_start
@@ -252,7 +254,7 @@ def map_reflectance_kernel(
             if matt_out.shape[0] > 0:
                 left = wp.max(left - seen / count, wp.vec3(0.0, 0.0, 0.0))
                 matt_out[i, j] = left
-            # As in the picture: the reciprocal of a mean is too large, by its relative variance.
+            # Corrected as in the picture: the reciprocal of a mean is too large by its relative variance.
             for c in range(3):
                 if total[c] > 0.0:
                     total[c] += variance[c] / total[c]
@@ -269,22 +271,23 @@ def light_of_pixel(image: LightImage, place: wp.int32, followed: wp.float32) -> 
     return wp.vec2(total / followed, wp.max(squares - total * total / paths, 0.0) / (followed * followed))
 
 
-# In a pixel that shows a proxy E and the difference come from the same directions, so that much of their noise cancels
-# in the ratio: with the means over samples of g and e, and L0 the frame there,
+# In a pixel that shows a proxy, E and the difference are found by the same directions, so that much of their noise
+# cancels in the ratio. With the means of g and e over samples, and L0 the frame's radiance,
 #
-#     picture = z + rho g,    rho = L0 / e,
+#     picture = z + rho g,    rho = L0 / e.
 #
-# g together with what ``path_photons`` brings where it follows light from its lights.
+# g includes the light found by ``path_photons``, if paths from lights are followed.
 #
 # A ratio of means is biased: to first order in 1 / n, the number of samples,
 #
 #     E[g / e] = G / E (1 + var(e) / (n E^2) - cov(g, e) / (n G E)).
 #
-# Where light is rare that is much: with a standard deviation of 10 E and 1,000 samples 10 %. [Bea62] takes it off,
+# If few samples find light, the bias is large: 10 % with a standard deviation of 10 E and 1,000 samples. [Bea62]
+# removes it:
 #
 #     g / e  ->  (g + cov(g, e) / (n e)) / (e (1 + var(e) / (n e^2))),
 #
-# which leaves an error in 1 / n^2 and, other than subtracting it, is bounded where a few samples have all the light.
+# which leaves an error in 1 / n^2 and, unlike subtraction of the bias, is bounded if a few samples have all the light.
 # The variance is, to first order, that of z + rho g - b e, b = rho g / e (0 where reflectance is held at 1), over the
 # number of samples, rho and b with the same corrections: so moments of the three are summed.
 @wp.kernel(enable_backward=False)
@@ -303,7 +306,7 @@ def finish_picture_kernel(
     sampled_out: wp.array2d[wp.vec3],
     image_out: wp.array2d[wp.vec3ub],
 ):
-    """The picture and its standard error, from the moments of every pixel's samples."""
+    """Write the picture and its standard error from the moments of each pixel's samples."""
     i, j = wp.tid()
     i += row_start
     count = wp.float32(moments.samples[i, j])
@@ -311,7 +314,7 @@ def finish_picture_kernel(
     zz = moments.fixed_fixed[i, j]
     picture = z
     variance = zz
-    of_lights = wp.vec3(0.0, 0.0, 0.0)  # variance of what was followed from lights
+    of_lights = wp.vec3(0.0, 0.0, 0.0)  # variance of the light of paths from lights
     if moments.proxies[i, j] > 0.0:
         g = moments.change[i, j]
         e = moments.light[i, j]
@@ -356,7 +359,7 @@ def finish_picture_kernel(
 
 
 def make_moments(shape: tuple[int, int], device: wp.DeviceLike) -> Moments:
-    """Moments of no samples."""
+    """Return moments of no samples, for (H, W) pixels."""
     moments = Moments()
     for name in Moments.vars:
         dtype = {"proxies": wp.float32, "rays": wp.int32, "samples": wp.int32}.get(name, wp.vec3)
@@ -365,9 +368,9 @@ def make_moments(shape: tuple[int, int], device: wp.DeviceLike) -> Moments:
 
 
 def map_reflectance(scene: LocalScene, moments: Moments, reflectance_out: wp.array2d[wp.vec3]) -> None:
-    """Write the reflectance of what every pixel shows, by moments of ``IRRADIANCE``; (H, W), 0 without a proxy.
+    """Write the reflectance of the proxy in every pixel, (H, W), by moments of ``IRRADIANCE``; 0 without a proxy.
 
-    Where proxies are glossy ``scene.matt`` is written too.
+    If proxies are glossy, ``scene.matt`` is written too.
     """
     shape, device = reflectance_out.shape, reflectance_out.device
     inputs = [scene.radiance, scene.shown, moments.light, moments.light_light]
@@ -377,17 +380,17 @@ def map_reflectance(scene: LocalScene, moments: Moments, reflectance_out: wp.arr
 
 
 finish_picture = row_launcher(finish_picture_kernel, outputs=4)
-"""Write what the moments say.
+"""Write the picture and its standard error from the moments.
 
 Args:
-    radiance: Of the frame, where proxies are shown, without what they mirror: ``LocalScene.matt``.
-    encode_table: Of ``color.encode_table``.
-    moments: (H, W).
-    image: What paths from virtual lights brought, for as many pixels.
-    followed: Paths from virtual lights per pixel, 0 if none were.
+    radiance: (H, W) ``LocalScene.matt``: the frame's radiance without specular reflections of proxies.
+    encode_table: From ``color.encode_table``.
+    moments: (H, W) moments of samples.
+    image: (H, W) light of paths from virtual lights.
+    followed: Number of paths from virtual lights per pixel; 0 for none.
     exposure: Factor on the radiance that is encoded.
     radiance_out: (H, W) linear radiance in camera values, not clipped.
-    error_out: (H, W) its standard error, per channel.
-    sampled_out: (H, W) what it would be without that of ``image``.
+    error_out: (H, W) standard error of the radiance, per channel.
+    sampled_out: (H, W) radiance without the light of ``image``.
     image_out: (H, W) encoded.
 """

@@ -1,26 +1,26 @@
-"""Directions in which paths go on: drawn by the environment's light, by a virtual light, or by the surface.
+"""Sampling of directions for paths: by the environment's light, by a virtual light, or by the surface.
 
-Each way to draw a direction has its density, per steradian, so that two ways can be combined by the balance heuristic
-[VG95]: a direction of density p that another way would have drawn with density q counts p / (p + q) of its light.
+Each strategy has a density per steradian, so that two strategies can be combined by the balance heuristic [VG95]: light
+from a direction of density p, which the other strategy draws with density q, is weighted by p / (p + q).
 
-Environment. A texel is drawn by inverting the cumulative sums of rows, then of the texels of one row, of brightness
-times solid angle; within a texel directions are uniform. Radiance is looked up bilinearly, so that the light of one
-texel reaches into those around it: what is summed is brightness after a tent of three texels, and a hundredth of the
-mean everywhere, which leaves no direction that has light without samples.
+Environment. A texel is drawn by inverting cumulative sums of rows, then of the texels of one row. Within a texel
+directions are uniform. The sums are of brightness times solid angle. Brightness is filtered by a tent of three texels,
+because radiance is interpolated bilinearly and reaches into neighbouring texels. A hundredth of the mean is added, so
+that every direction with light has samples.
 
-Near emitters. Texels that show an emitter at a known distance D from where it is mirrored are taken out of the
-distant environment, less what surrounds them, and lie on a sphere of that radius. Seen from a point at distance d a
-texel has D^2 cos / d^2 of its solid angle, cos that between the ray and the sphere's normal, and is 1 / cos as bright:
-emitters shine evenly to all sides, as ``emitters`` has it. They hide nothing. One direction in so many is drawn toward
-them, by their light.
+Near emitters. The texels that show an emitter at a known distance D are taken out of the distant environment, less the
+radiance around them, and placed on a sphere of radius D around the point that reflects the emitter. Seen from a point
+at distance d, a texel has D^2 cos / d^2 times its solid angle, cos between the ray and the sphere's normal, and 1 / cos
+times its radiance: emitters have the same intensity in all directions, as in ``emitters``. They hide nothing. A fixed
+share of directions, ``near_share``, is drawn toward them, by their light.
 
-Surfaces. A lobe is chosen in proportion to its reflectance, a cosine for the diffuse part, visible half vectors for
-GGX, the lobe itself for Phong. What a surface reflects is that of ``materials``, to which all of this only adds
-densities. A mirror has no density: its direction counts in full.
+Surfaces. A lobe is chosen with a probability proportional to its reflectance: the cosine for the diffuse part, visible
+half vectors for GGX, the lobe itself for Phong. Reflection is that of ``materials``; this module adds the densities
+alone. A mirror has no density, and its direction is weighted in full.
 
-Virtual lights of a radius are disks that face the point, as ``shadow`` has them: with the irradiance E of a surface
-that faces the light, its disk has the radiance E p, p = d^2 / (pi r^2 cos^3) the density of a uniform point of the disk
-seen from distance d under the angle to its centre, so that the disk's irradiance is E whatever d is.
+Virtual lights with a radius are disks that face the point, as in ``shadow``. With E the irradiance of a surface that
+faces the light, the disk has the radiance E p, where p = d^2 / (pi r^2 cos^3) is the density of a uniform point of the
+disk at distance d and the angle of cos to its centre. So the disk's irradiance is E at any d.
 
 References:
     [VG95] Veach, Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering", SIGGRAPH 1995.
@@ -71,35 +71,35 @@ STREAMS = wp.constant(16)
 SEED_STEP = wp.constant(wp.uint32(0x9E3779B9))
 
 LEAST_COSINE = wp.constant(wp.float32(0.1))
-"""Least cosine between a ray and the sphere of an emitter; an emitter seen from the side is not thin."""
+"""Least cosine between a ray and the normal of an emitter's sphere: bounds the radiance of emitters seen edge-on."""
 
 reflect_direct = make_reflect_direct(ALL_MODELS)
 
 
 @wp.struct
 class Sky:
-    """The environment as paths read it."""
+    """The environment with its sampling tables."""
 
     radiance: wp.array2d[wp.vec3]  # latlong
-    density: wp.array2d[wp.float32]  # per steradian, of ``draw_sky``, constant within a texel
+    density: wp.array2d[wp.float32]  # of ``draw_sky``, per steradian, constant within a texel
     rows: wp.array[wp.float32]  # (H + 1) cumulative, from 0 to 1
     columns: wp.array2d[wp.float32]  # (H, W + 1) cumulative along each row, from 0 to 1
 
     emitters: wp.array[Emitter]  # near ones
-    near_share: wp.float32  # chance of ``draw_sky`` to draw a direction toward them
-    near_radiance: wp.array2d[wp.vec3]  # of the texels that show one, as seen from where they were mirrored
-    near_density: wp.array2d[wp.float32]  # per steradian from there, of the texels that are drawn
-    near_owner: wp.array2d[wp.int32]  # the emitter that a texel shows, or -1
-    near_texels: wp.array[wp.int32]  # those that show one
-    near_steps: wp.array[wp.float32]  # (n + 1) cumulative over these, from 0 to 1
+    near_share: wp.float32  # probability that ``draw_sky`` draws a direction toward near emitters
+    near_radiance: wp.array2d[wp.vec3]  # of texels that show an emitter, seen from the point that reflects it
+    near_density: wp.array2d[wp.float32]  # of these texels, per steradian from that point
+    near_owner: wp.array2d[wp.int32]  # index of the emitter that a texel shows, or -1
+    near_texels: wp.array[wp.int32]  # (n) indices of the texels that show an emitter
+    near_steps: wp.array[wp.float32]  # (n + 1) cumulative over these texels, from 0 to 1
 
 
 @wp.struct
 class SkyLight:
-    """Light that was drawn from the environment."""
+    """A sample of the environment's light."""
 
     direction: wp.vec3  # unit
-    distance: wp.float32  # of what sends it; FAR for the distant environment
+    distance: wp.float32  # of its source; FAR for the distant environment
     radiance: wp.vec3
     density: wp.float32  # per steradian
 
@@ -115,7 +115,7 @@ class PathKey:
 
 @wp.func
 def random_triple(key: PathKey, vertex: wp.int32, stream: wp.int32) -> wp.vec3:
-    """Three independent numbers in [0, 1), the same whenever they are asked for."""
+    """Return three independent random numbers in [0, 1), always the same for the same arguments."""
     z = key.seed * SEED_STEP + wp.uint32(vertex * STREAMS + stream)
     bits = pcg3d_hash(key.pixel, key.sample, z)
     return wp.vec3(uniform_from_bits(bits[0]), uniform_from_bits(bits[1]), uniform_from_bits(bits[2]))
@@ -123,7 +123,7 @@ def random_triple(key: PathKey, vertex: wp.int32, stream: wp.int32) -> wp.vec3:
 
 @wp.func
 def balance(density: wp.float32, other: wp.float32) -> wp.float32:
-    """Share of the light of a direction that counts for the way that drew it with ``density``."""
+    """Return the balance heuristic's weight of a strategy of ``density`` against one of density ``other``."""
     if density < 0.0:
         return 1.0
     return density / (density + other)
@@ -131,7 +131,7 @@ def balance(density: wp.float32, other: wp.float32) -> wp.float32:
 
 @wp.func
 def find_step(cumulative: wp.array[wp.float32], u: wp.float32) -> wp.int32:
-    """Index k with cumulative[k] <= u < cumulative[k + 1], of sums from 0 to 1; never a step of no height."""
+    """Return the k with cumulative[k] <= u < cumulative[k + 1], of sums from 0 to 1; never a step of height 0."""
     low = wp.int32(0)
     high = cumulative.shape[0] - 2
     while low < high:
@@ -145,7 +145,7 @@ def find_step(cumulative: wp.array[wp.float32], u: wp.float32) -> wp.int32:
 
 @wp.func
 def direction_in_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int32, u: wp.vec2) -> wp.vec3:
-    """Direction uniform in a texel's solid angle: in sin^2 of half the polar angle, which keeps its digits."""
+    """Draw a uniform direction in a texel, by sin^2 of half the polar angle, which is accurate near the pole."""
     step = 0.5 * PI / wp.float32(height)
     top = wp.sin(step * wp.float32(row))
     bottom = wp.sin(step * wp.float32(row + 1))
@@ -157,21 +157,21 @@ def direction_in_texel(row: wp.int32, column: wp.int32, height: wp.int32, width:
 
 @wp.func
 def within_step(cumulative: wp.array[wp.float32], step: wp.int32, u: wp.float32) -> wp.float32:
-    """Return the place of a number within a step of ``find_step``, 0 to 1."""
+    """Return the position, 0 to 1, of ``u`` within a step of ``find_step``."""
     low = cumulative[step]
     return wp.clamp((u - low) / wp.max(cumulative[step + 1] - low, 1.0e-30), 0.0, 1.0)
 
 
 @wp.func
 def texel_of(direction: wp.vec3, height: wp.int32, width: wp.int32) -> wp.vec2i:
-    """Row and column of the texel in which a direction lies."""
+    """Return the row and column of the texel that contains a direction."""
     at = latlong_from_direction(direction, height, width)
     return wp.vec2i(wp.clamp(wp.int32(at[0]), 0, height - 1), wp.clamp(wp.int32(at[1]), 0, width - 1))
 
 
 @wp.func
 def draw_sky(sky: Sky, origin: wp.vec3, u: wp.vec2, v: wp.float32) -> SkyLight:
-    """Light of the environment that arrives at ``origin`` if nothing is in the way; ``v`` picks a near emitter."""
+    """Draw light of the environment at ``origin``, occlusion ignored; ``v`` decides whether of a near emitter."""
     height = sky.radiance.shape[0]
     width = sky.radiance.shape[1]
     light = SkyLight()
@@ -180,7 +180,7 @@ def draw_sky(sky: Sky, origin: wp.vec3, u: wp.vec2, v: wp.float32) -> SkyLight:
         texel = sky.near_texels[step]
         row = texel / width
         column = texel % width
-        # The number that picked the texel among those of its row is used up: what is left of it says where within.
+        # The remainder of the number that picked the texel gives the position within the texel.
         within = wp.vec2(within_step(sky.near_steps, step, u[0]), u[1])
         normal = direction_in_texel(row, column, height, width, within)
         emitter = sky.emitters[sky.near_owner[row, column]]
@@ -206,7 +206,7 @@ def draw_sky(sky: Sky, origin: wp.vec3, u: wp.vec2, v: wp.float32) -> SkyLight:
 
 @wp.func
 def sky_radiance(sky: Sky, direction: wp.vec3, density: wp.float32) -> wp.vec3:
-    """Radiance of the distant environment, by its share for a ray that was drawn with ``density``."""
+    """Return the radiance of the distant environment, weighted for a ray that was drawn with ``density``."""
     texel = texel_of(direction, sky.radiance.shape[0], sky.radiance.shape[1])
     other = (1.0 - sky.near_share) * sky.density[texel[0], texel[1]]
     return balance(density, other) * sample_latlong(sky.radiance, direction)
@@ -214,7 +214,7 @@ def sky_radiance(sky: Sky, direction: wp.vec3, density: wp.float32) -> wp.vec3:
 
 @wp.func
 def near_radiance(sky: Sky, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, density: wp.float32) -> wp.vec3:
-    """Radiance of near emitters that a ray passes before ``t_max``, by its share as ``sky_radiance``."""
+    """Return the radiance of near emitters on a ray before ``t_max``, weighted as in ``sky_radiance``."""
     radiance = wp.vec3(0.0, 0.0, 0.0)
     height = sky.radiance.shape[0]
     width = sky.radiance.shape[1]
@@ -241,7 +241,7 @@ def near_radiance(sky: Sky, origin: wp.vec3, direction: wp.vec3, t_max: wp.float
 
 @wp.func
 def lobe_chance(surface: Surface) -> wp.float32:
-    """Probability of the glossy lobe."""
+    """Return the probability of sampling the glossy lobe."""
     glossy = brightness(surface.reflectance)
     diffuse = brightness(surface.diffuse)
     if glossy <= 0.0:
@@ -253,13 +253,13 @@ def lobe_chance(surface: Surface) -> wp.float32:
 
 @wp.func
 def lobe_alpha(surface: Surface) -> wp.float32:
-    """Width of a GGX lobe, no narrower than ``reflect_direct`` has it."""
+    """Return the width alpha of a GGX lobe, at least the minimum of ``reflect_direct``."""
     return wp.max(surface.roughness * surface.roughness, MIN_ALPHA)
 
 
 @wp.func
 def surface_density(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> wp.float32:
-    """Density with which ``draw_reflected`` gives ``wi``; 0 for mirrors and behind the surface."""
+    """Return the density with which ``draw_reflected`` draws ``wi``; 0 for mirrors and behind the surface."""
     cosine = wp.dot(normal, wi)
     if cosine <= 0.0 or surface.model == wp.static(int(MIRROR)):
         return 0.0
@@ -283,7 +283,7 @@ def surface_density(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3)
 def draw_reflected(
     surface: Surface, normal: wp.vec3, geometric: wp.vec3, wo: wp.vec3, pick: wp.float32, u: wp.vec2
 ) -> wp.vec3:
-    """Direction from which a surface reflects light toward ``wo``, unit; zero if it leads into the surface."""
+    """Draw a unit direction from which a surface reflects light toward ``wo``; zero if it leads into the surface."""
     wi = reflect(wo, normal)
     if surface.model != wp.static(int(MIRROR)):
         basis = frame_from_normal(normal)
@@ -302,13 +302,13 @@ def draw_reflected(
 
 @wp.func
 def disk_density(light: Light, distance: wp.float32, cosine: wp.float32) -> wp.float32:
-    """Density of a uniform point of a light's disk, seen from a distance of its centre under an angle to it."""
+    """Return the density per steradian of a uniform point of a light's disk; ``cosine`` of the angle to its centre."""
     return distance * distance / (PI * light.radius * light.radius * cosine * cosine * cosine)
 
 
 @wp.func
 def draw_on_light(light: Light, sample: LightSample, u: wp.vec2) -> wp.vec4:
-    """Direction toward a point of a light, unit, and how far that is; a light without a disk is its centre."""
+    """Return the unit direction toward a random point of a light, and its distance; of its centre if it has no disk."""
     if not has_penumbra(light, sample):
         return wp.vec4(sample.wi[0], sample.wi[1], sample.wi[2], sample.distance)
     disk = light.radius * sample_disk(u)
@@ -321,7 +321,7 @@ def draw_on_light(light: Light, sample: LightSample, u: wp.vec2) -> wp.vec4:
 def lights_in_the_way(
     lights: wp.array[Light], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, density: wp.float32
 ) -> wp.vec3:
-    """Radiance of the disks of virtual lights that a ray of ``density`` meets before ``t_max``, by its share."""
+    """Return the weighted radiance of lights' disks that a ray of ``density`` meets before ``t_max``."""
     radiance = wp.vec3(0.0, 0.0, 0.0)
     for index in range(lights.shape[0]):
         light = lights[index]
@@ -338,7 +338,7 @@ def lights_in_the_way(
 
 
 def _cumulative(weight: np.ndarray) -> np.ndarray:
-    """Sums of weights along the last axis, from 0 to 1, one longer than these."""
+    """Return normalised cumulative sums along the last axis, from 0 to 1, longer than the weights by one."""
     sums = np.cumsum(weight, axis=-1)
     return np.concatenate([np.zeros((*weight.shape[:-1], 1)), sums / sums[..., -1:]], axis=-1)
 
@@ -349,7 +349,7 @@ def _solid_angles(height: int, width: int) -> np.ndarray:
 
 
 def sky_tables(radiance: np.ndarray) -> dict[str, np.ndarray]:
-    """The cumulative sums and densities of ``Sky`` without near emitters, computed in float64.
+    """Compute the cumulative sums and densities of ``Sky`` without near emitters, in float64.
 
     Args:
         radiance: Latlong (H, W, 3), linear; negative values and NaN count as 0.
@@ -360,7 +360,7 @@ def sky_tables(radiance: np.ndarray) -> dict[str, np.ndarray]:
     clean = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=float(MAX_RADIANCE)), 0.0, float(MAX_RADIANCE))
     height, width = clean.shape[:2]
     bright = clean.astype(np.float64).mean(axis=2)
-    beyond = np.roll(bright, width // 2, axis=1)  # beyond a pole lies its other side
+    beyond = np.roll(bright, width // 2, axis=1)  # rows beyond a pole are those of the opposite meridian
     tall = np.concatenate([beyond[:1], bright, beyond[-1:]])
     tall = 0.25 * tall[:-2] + 0.5 * tall[1:-1] + 0.25 * tall[2:]
     tent = 0.25 * np.roll(tall, 1, axis=1) + 0.5 * tall + 0.25 * np.roll(tall, -1, axis=1)
@@ -378,17 +378,17 @@ def sky_tables(radiance: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def split_emitters(radiance: np.ndarray, emitters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Take what near emitters send out of an environment.
+    """Split an environment into the light of near emitters and the rest.
 
-    A texel shows the emitter that it is nearest to, if it is as bright as clipping and within ``EMITTER_COSINE`` of its
-    direction, as for ``environment_samples``. What surrounds them stays: the mean of the other texels in that cone.
+    A texel shows the nearest emitter, if it is as bright as clipping and within ``EMITTER_COSINE`` of the emitter's
+    direction, as in ``environment_samples``. The mean of the other texels in that cone remains in its place.
 
     Args:
         radiance: Latlong (H, W, 3), clean.
         emitters: Records of ``structs.Emitter``, near ones.
 
     Returns:
-        The distant environment and the near part, (H, W, 3) each, and (H, W) which emitter a texel shows, or -1.
+        The distant environment and the near part, (H, W, 3) each, and the emitter that each texel shows, or -1, (H, W).
     """
     height, width = radiance.shape[:2]
     theta = (np.arange(height) + 0.5)[:, None] * np.pi / height
@@ -410,12 +410,12 @@ def _are_near(emitters: np.ndarray) -> np.ndarray:
 
 
 def make_sky(radiance: np.ndarray, device: wp.DeviceLike, emitters: np.ndarray | None = None) -> Sky:
-    """The environment with its tables on a device.
+    """Return the environment with its sampling tables, on a device.
 
     Args:
         radiance: As for ``sky_tables``.
-        device: Where to.
-        emitters: Records of ``structs.Emitter``; those that are not near stay part of the environment.
+        device: Device of the arrays.
+        emitters: Records of ``structs.Emitter``; distant ones remain part of the environment.
     """
     sky = Sky()
     clean = sky_tables(radiance)["radiance"]

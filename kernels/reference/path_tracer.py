@@ -1,11 +1,11 @@
-"""The picture that the local scene would give, by following paths of light: the judge of what is approximated.
+"""Path tracer of the local scene: the reference picture, against which approximations are measured.
 
-A path starts at the camera (``path_vertices``: what it meets; ``path_following``: how it goes on). ``trace_paths``
-takes samples, of which ``path_picture`` makes the moments of every pixel, and the picture of these:
+A path starts at the camera. ``path_vertices`` defines the surfaces that it meets, ``path_following`` its next ray.
+``trace_paths`` takes samples. ``path_picture`` computes moments of every pixel's samples, and the picture from them:
 
     find_shown -> trace_paths (IRRADIANCE) -> map_reflectance -> trace_paths (DIFFERENCE) -> finish_picture.
 
-Where no frame is given, all paths are whole (``WHOLE``), and proxies have the reflectance that they are given.
+Without a frame all paths carry whole radiance (``WHOLE``), and proxies have the reflectance that the scene gives.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ def sample_key(samples: Round, k: wp.int32, seed: wp.int32, first: wp.int32, don
 
 @wp.func
 def camera_ray(params: FrameParams, rays: wp.array2d[wp.vec2], key: PathKey) -> wp.vec3:
-    """Direction through a random point of a pixel, unit."""
-    # A stream of its own: the vertices of the path use those from 0 on.
+    """Return the unit direction through a random point of a pixel."""
+    # A random stream of its own: the vertices of the path use streams from 0 on.
     bits = pcg3d_hash(key.pixel, key.sample, ~key.seed)
     pixel = wp.int32(key.pixel)
     ray = rays[pixel / rays.shape[1], pixel % rays.shape[1]]
@@ -69,7 +69,7 @@ def camera_ray(params: FrameParams, rays: wp.array2d[wp.vec2], key: PathKey) -> 
 
 @wp.func
 def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bool) -> PathPair:
-    """A path on the camera's ray."""
+    """Return a path that starts on the camera's ray."""
     pair = PathPair()
     pair.path.throughput = wp.vec3(1.0, 1.0, 1.0)
     pair.path.origin = origin
@@ -84,7 +84,10 @@ def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bo
 def see(
     scene: LocalScene, asked: wp.int32, vertex: Vertex, pair: PathPair, k: wp.int32, samples_out: Round
 ) -> PathPair:
-    """Trace the camera's ray; return whether there is a path to follow, and write what needs none."""
+    """Start a sample at the first surface of the camera's ray, and write the radiance that needs no path.
+
+    ``next`` of the result is ``SURFACE`` if there is a path to follow, else ``ENDED``.
+    """
     out = pair
     out.next = ENDED
     whole = asked == wp.static(WHOLE)
@@ -97,7 +100,7 @@ def see(
         pixel = samples_out.pixels[k]
         z = scene.radiance[pixel / scene.radiance.shape[1], pixel % scene.radiance.shape[1]]
         out.path.changes_only = True
-        # A face that is seen from behind is not the surface that the camera sees.
+        # A proxy seen from behind is not a visible surface.
         if vertex.kind == PROXY and not is_turned(vertex, pair.path.direction):
             out.white = True
             out.glossy = is_glossy(scene, vertex)
@@ -115,19 +118,20 @@ def see(
 
 @wp.func
 def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
-    """Write what a path that has ended tells of its pixel, as ``add_sample`` takes it."""
+    """Write the quantities z, g and e of a path that has ended, for ``add_sample``."""
     samples_out.rays[k] = samples_out.rays[k] + pair.rays
     if not pair.white or (pair.lobe and not pair.only_light):
         samples_out.z[k] = samples_out.z[k] + pair.radiance
     elif pair.lobe:
-        samples_out.g[k] = pair.light  # what the frame shows mirrored
+        samples_out.g[k] = pair.light  # radiance that the proxy reflects specularly in the frame
     else:
         samples_out.g[k] = pair.radiance
         samples_out.e[k] = pair.light
 
 
-# One loop for all rays of a sample, its camera's as well: so what finds a surface is in the kernel once. A warp of a
-# GPU waits for the longest of its 32 paths; threads that went on with samples of a shared counter were no faster.
+# One loop for all rays of a sample, the camera's included, so that the code that finds a surface is in the kernel once.
+# A warp of a GPU waits for the longest of its 32 paths; threads that took further samples from a shared counter were
+# no faster.
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
@@ -173,7 +177,7 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
             if pair.next == ENDED:
                 write_sample(pair, k, samples_out)
                 begins = True
-                # The gloss of what the pixel shows has a path of its own.
+                # The specular lobe of the pixel's proxy has a path of its own.
                 lobe = pair.glossy and not lobe
                 is_done = not lobe
 
@@ -199,7 +203,7 @@ def make_find_shown_kernel(trace: TraceConfig) -> wp.Kernel:
         ray = scene.picture.rays[i, j]
         shown = wp.int32(-1)
         for k in range(5):
-            # The middle, then the corners: a pixel of two surfaces has the radiance of neither.
+            # The centre, then the corners: a pixel of two surfaces has the radiance of neither.
             x = wp.where(k == 0, 0.0, wp.where(k % 2 == 0, 0.5, -0.5))
             y = wp.where(k == 0, 0.0, wp.where(k < 3, -0.5, 0.5))
             toward = wp.vec3(ray[0] + x / params[0].focal[0], ray[1] + y / params[0].focal[1], 1.0)
@@ -223,14 +227,14 @@ trace_paths = row_launcher(make_trace_paths_kernel, like=lambda *given: (given[-
 Args:
     trace: Kinds of shape in the scene.
     params: (1,) FrameParams: the camera.
-    scene: All that paths meet.
+    scene: Surfaces and lights that paths meet.
     asked: ``WHOLE``, ``DIFFERENCE`` or ``IRRADIANCE``; all but the first need the frame's radiance.
-    seed: Of the random numbers.
-    first: Number of a pixel's first sample among those of the seed.
-    done: (H, W) samples of each pixel in rounds before.
-    samples_out: Of ``list_samples``.
+    seed: Seed of the random numbers.
+    first: Index of a pixel's first sample among those of the seed.
+    done: (H, W) number of each pixel's samples in earlier rounds.
+    samples_out: From ``list_samples``.
 """
 
 
 find_shown = row_launcher(make_find_shown_kernel)
-"""Write which proxy alone the frame shows in every pixel, -1 for none or several surfaces; (H, W)."""
+"""Write the index of the proxy that fills each pixel, -1 if the pixel shows no proxy or several surfaces; (H, W)."""

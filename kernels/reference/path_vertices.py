@@ -1,7 +1,7 @@
-"""Surfaces that paths meet in the local scene, their materials, and the frame's picture of them.
+"""Surfaces that paths meet in the local scene, their materials, and their radiance in the frame.
 
-``LocalScene`` is all that the program knows: virtual objects, proxies, mirror balls, virtual lights, and the
-environment, which is distant. ``kernels/reference/path_following.py`` goes from vertex to vertex.
+``LocalScene`` holds virtual objects, proxies, mirror balls, virtual lights, and the distant environment.
+``kernels/reference/path_following.py`` extends paths from vertex to vertex.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ NOTHING = wp.constant(0)
 OBJECT = wp.constant(1)
 PROXY = wp.constant(2)
 BALL = wp.constant(3)
-"""Kind of thing that a ray meets."""
+"""Kind of surface: a mirror ball."""
 LEAST_WEIGHT = wp.constant(wp.float32(0.25))
-"""Least bilinear weight of the four pixels around a point that show its surface, for the point to count as seen."""
+"""Least sum of bilinear weights of pixels that show a point's surface, for the frame to show the point."""
 
 
 @wp.struct
 class LocalScene:
-    """All that paths can meet."""
+    """Surfaces and lights that paths can meet, and the frame."""
 
     rays: RayScene
     lights: wp.array[Light]
-    lights_followed: wp.bool  # whether their light is followed from them, where white surfaces have it from others
-    near_followed: wp.bool  # likewise light of near emitters
+    lights_followed: wp.bool  # whether paths from lights add light that white surfaces receive by polished objects
+    near_followed: wp.bool  # whether paths from near emitters do the same
     probes: wp.array[Probe]
     sky: Sky
-    spheres: wp.array[wp.vec4]  # centre and radius, around virtual objects; paths from lights start toward them
-    dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``
-    proxy_reflectance: wp.array[wp.vec3]  # of each proxy, where no pixel tells
+    spheres: wp.array[wp.vec4]  # centre and radius of spheres around objects, toward which paths from lights start
+    dfg: wp.array2d[wp.vec2]  # from ``integrate_dfg``
+    proxy_reflectance: wp.array[wp.vec3]  # of each proxy, for points that no pixel shows
     gloss: wp.array[wp.vec4]  # of each proxy: F0 and perceptual roughness; empty: all are matt
     picture: Picture  # rays of pixels; of the frame only the size is read
     radiance: wp.array2d[wp.vec3]  # the frame, linear; empty: there is none
-    matt: wp.array2d[wp.vec3]  # the frame less what proxies mirror in it; ``radiance`` itself where none does
-    reflectance: wp.array2d[wp.vec3]  # of what each pixel shows
-    shown: wp.array2d[wp.int32]  # the proxy that each pixel shows, or -1
+    matt: wp.array2d[wp.vec3]  # the frame less specular reflections of proxies; ``radiance`` if all are matt
+    reflectance: wp.array2d[wp.vec3]  # of the surface in each pixel
+    shown: wp.array2d[wp.int32]  # index of the proxy in each pixel, or -1
 
 
 @wp.struct
@@ -66,23 +66,23 @@ class Vertex:
     """A surface that a path meets."""
 
     kind: wp.int32  # NOTHING, OBJECT, PROXY or BALL
-    index: wp.int32  # of the ball
+    index: wp.int32  # index of the ball
     hit: Hit
 
 
 @wp.struct
 class Seen:
-    """Observation in the frame of a point of a proxy."""
+    """Radiance and reflectance of a proxy's point in the frame."""
 
-    known: wp.bool
+    known: wp.bool  # whether the frame shows the point
     radiance: wp.vec3
     reflectance: wp.vec3
-    rays: wp.int32  # that were traced to find out
+    rays: wp.int32  # number of rays traced to find them
 
 
 @wp.func
 def from_viewer(vertex: Vertex, wo: wp.vec3) -> Vertex:
-    """A vertex whose normals are on the viewer's side, the one for shading at least a little."""
+    """Turn the normals of a vertex toward the viewer; the shading normal keeps a least cosine."""
     result = vertex
     normal, geometric = face_viewer(vertex.hit.normal, vertex.hit.geometric_normal, wo)
     result.hit.normal = normal
@@ -92,7 +92,7 @@ def from_viewer(vertex: Vertex, wo: wp.vec3) -> Vertex:
 
 @functools.cache
 def make_find_vertex(trace: TraceConfig) -> wp.Function:
-    """``find_vertex(scene, origin, direction, objects) -> Vertex``: the first; if ``objects``, of virtual ones too."""
+    """``find_vertex(scene, origin, direction, objects) -> Vertex``: first surface; if ``objects``, virtual ones too."""
     functions = make_trace(trace)
     closest_object, closest_proxy = functions.closest_object, functions.closest_proxy
 
@@ -116,7 +116,7 @@ def make_find_vertex(trace: TraceConfig) -> wp.Function:
             vertex.kind = BALL
             vertex.index = ball
         if objects:
-            # Where object and proxy touch, the object is seen: both depths carry a few roundings.
+            # Where object and proxy touch, the object is visible: both depths have rounding errors.
             reach = wp.min(vertex.hit.t * (1.0 + 16.0 * ROUNDING), FAR)
             hit = closest_object(scene.rays, origin, direction, reach)
             if hit.shape >= 0:
@@ -143,7 +143,7 @@ def make_hidden_by_physical(trace: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_see_in_frame(trace: TraceConfig) -> wp.Function:
-    """``see_in_frame(params, scene, hit) -> Seen``: a proxy's point where the frame shows it, bilinear."""
+    """``see_in_frame(params, scene, hit) -> Seen``: a proxy's point in the frame, bilinearly interpolated."""
     find_in_frame = make_find_in_frame(trace)
 
     @wp.func(module="unique")
@@ -179,7 +179,7 @@ def make_see_in_frame(trace: TraceConfig) -> wp.Function:
 
 @wp.func
 def is_glossy(scene: LocalScene, vertex: Vertex) -> wp.bool:
-    """Return whether a vertex is on a proxy that mirrors."""
+    """Return whether a vertex lies on a glossy proxy."""
     if vertex.kind != PROXY or scene.gloss.shape[0] == 0:
         return False
     values = scene.gloss[vertex.hit.shape]
@@ -188,7 +188,7 @@ def is_glossy(scene: LocalScene, vertex: Vertex) -> wp.bool:
 
 @wp.func
 def polished(scene: LocalScene, vertex: Vertex, diffuse: wp.vec3) -> Surface:
-    """A glossy proxy's surface: the lobe of ``gloss`` beside what is scattered."""
+    """Return a glossy proxy's surface: the lobe of ``gloss`` and a diffuse part."""
     values = scene.gloss[vertex.hit.shape]
     surface = Surface()
     surface.model = wp.static(int(METALLIC_ROUGHNESS))
@@ -202,9 +202,9 @@ def polished(scene: LocalScene, vertex: Vertex, diffuse: wp.vec3) -> Surface:
 
 @functools.cache
 def make_look_up_material() -> wp.Function:
-    """``look_up_material(scene, vertex, wo, reflectance) -> Surface``: what a vertex is made of, seen from ``wo``.
+    """``look_up_material(scene, vertex, wo, reflectance) -> Surface``: material of a vertex seen from ``wo``.
 
-    The only place that knows how objects' materials are stored. ``reflectance`` is a proxy's.
+    ``reflectance`` is used for a proxy. No other function reads how objects' materials are stored.
     """
     surface_at = make_surface(ALL_MODELS, True)
 
@@ -213,7 +213,7 @@ def make_look_up_material() -> wp.Function:
         surface = Surface()
         if vertex.kind == OBJECT:
             hit = vertex.hit
-            # A cone without an angle: samples are many, and pictures are read at their finest level.
+            # A ray cone of angle 0: samples are many, so textures are read at their finest level.
             surface = surface_at(scene.rays, scene.dfg, hit, wp.dot(hit.normal, wo), 0.0)
         elif vertex.kind == BALL:
             surface.model = wp.static(int(MIRROR))
