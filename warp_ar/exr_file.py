@@ -65,7 +65,7 @@ class LinearPicture:
 def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str) -> LinearPicture:
     """Read a picture of linear light: Radiance's HDR by its ending, else OpenEXR.
 
-    The one reader of frames, light, environments and emission.
+    All frames, lights, environments and emission maps are read by this function.
 
     Follows:
         OpenEXR: first part with R G B or Y, half or float, display window (black without data), chromaticities,

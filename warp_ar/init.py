@@ -29,7 +29,7 @@ SCENE, MESH = "scene.toml", "teapot.ply"
 CARDS = tuple(
     (f"card-{paper}.{kind}", paper, dpi) for paper in ("a4", "letter") for kind, dpi in (("pdf", 600), ("png", 300))
 )
-"""Files of the card: name, paper, dots per inch."""
+"""Files of the card: name, paper size and dots per inch of each."""
 DEFAULT_RADIUS = 0.035
 """Radius of the ball, metres."""
 
@@ -50,16 +50,16 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def make_desk(folder: Path, source: str | int, radius: float) -> None:
-    """Make the folder with all that is in it, or nothing.
+    """Make the folder with all its files, or nothing on an error.
 
     Args:
-        folder: It must not be there yet.
+        folder: Path of the folder, which must not exist yet.
         source: A capture device's index, or a path.
         radius: The ball's radius in metres.
 
     Raises:
-        UsageError: The folder is there, or the radius fits no ball that stands on the card.
-        SinkError: It cannot be written.
+        UsageError: The folder exists, or no ball of this radius fits on the card.
+        SinkError: The folder cannot be written.
     """
     if folder.exists() or folder.is_symlink():
         raise UsageError(f"{folder}: is there already; expected the name of a new folder")

@@ -42,7 +42,7 @@ LEAST_SHARE = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class CapturedEmitter:
-    """Bright source in captured light; the map includes its light."""
+    """Bright source in captured light, whose light the map includes as well."""
 
     direction: tuple[float, float, float]
     """Unit vector from ``origin``."""

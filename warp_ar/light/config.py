@@ -73,7 +73,7 @@ class PriorConfig:
     least_alike: float = 0.05
     """Least ratio of a component's expected missing light to that of one clipped in all channels."""
     fades: tuple[float, float] = (0.6, 0.7)
-    """Radiance beside clipped cells over clipping: boundaries are sharp below the first, faded at the second."""
+    """Radiance next to clipped cells over clipping: boundaries are sharp below the first, faded at the second."""
     depth: float = 1.0
     """Radians inside a fading boundary up to which missing radiance grows."""
     spread: float = 0.8
