@@ -1,1 +1,1 @@
-"""Outputs: pictures, video, environment files, reports."""
+"""Outputs: pictures, video, environment files, exchange files and reports."""

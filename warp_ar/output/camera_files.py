@@ -1,12 +1,12 @@
-"""The camera for other programs: its way as OpenTrackIO samples, its lens as STMaps.
+"""Camera data for other programs: its track as OpenTrackIO samples, and its lens distortion as STMaps.
 
-A track (``.jsonl``) has one sample of protocol version 1.0 on each line. Distortion is left out, whose models there are
-in other units than OpenCV's: STMaps tell it.
+A track (``.jsonl``) has one sample of protocol version 1.0 per line. Distortion is left out, because OpenTrackIO's
+models have other units than OpenCV's; STMaps contain it.
 
-STMaps are pictures that tell compositors from where to take each pixel, to take a lens's distortion out or put it in.
-Red is s, from 0 at the left edge to 1 at the right; green is t, from 0 at the bottom to 1 at the top. Pixel centres lie
-at half-integers of the size, so column j has s = (j + 0.5) / width. 32 bits, for a pixel of a wide frame is less than a
-half can tell. Coordinates of what lies outside the frame are outside 0..1.
+An STMap is a picture that gives compositors the source position of each pixel, to remove or apply lens distortion. Red
+is s, from 0 at the left edge to 1 at the right; green is t, from 0 at the bottom to 1 at the top. Pixel centres are at
+half-integers of the size: column j has s = (j + 0.5) / width. Values have 32 bits, because 16-bit floats cannot resolve
+a pixel of a wide frame. Positions outside the frame are outside 0..1.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from warp_ar.scene.pixel_rays import pixel_rays
 TRACK_SUFFIX = ".jsonl"
 
 _SPACE = uuid.UUID("6f1f3c1e-8a4b-4e35-9f5e-0b8d8f0f7a11")
-"""Namespace of the samples' identifiers, which equal shots share."""
+"""UUID namespace of the samples' identifiers; equal shots have equal identifiers."""
 
 
 def write_track(path: Path, shot: Shot) -> list[Path]:
@@ -49,7 +49,7 @@ def write_track(path: Path, shot: Shot) -> list[Path]:
 
 
 def track_samples(shot: Shot) -> list[dict[str, Any]]:
-    """Return samples as JSON has them: z up, metres, degrees; the camera looks along +y where its angles are 0."""
+    """Return the samples as JSON objects: z up, metres, degrees; with all angles 0, the camera faces +y."""
     camera = shot.camera
     pixel = 1e3 * FILM_WIDTH / camera.width
     rate = fractions.Fraction(shot.fps).limit_denominator(1001)
@@ -68,7 +68,7 @@ def track_samples(shot: Shot) -> list[dict[str, Any]]:
     }
     samples = []
     for frame, placement in shot.camera_placements().items():
-        # A camera of OpenTrackIO looks along its y, its z up; this one along its -z, its y up.
+        # OpenTrackIO's camera faces +y with z up; this one faces -z with y up.
         turn = placement[:3, :3] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
         pan, tilt, roll = track_angles(turn)
         x, y, z = placement[:3, 3].tolist()
@@ -99,14 +99,14 @@ def track_samples(shot: Shot) -> list[dict[str, Any]]:
 def track_angles(turn: Matrix) -> tuple[float, float, float]:
     """Return pan, tilt and roll in degrees of a rotation Rz(pan) Rx(tilt) Ry(roll)."""
     tilt = math.asin(max(-1.0, min(1.0, float(turn[2, 1]))))
-    if abs(turn[2, 1]) > 1.0 - 1e-12:  # straight up or down: pan and roll are about one axis, and pan takes all
+    if abs(turn[2, 1]) > 1.0 - 1e-12:  # straight up or down: pan and roll share one axis, and pan takes the whole angle
         return math.degrees(math.atan2(turn[1, 0], turn[0, 0])), math.degrees(tilt), 0.0
     pan, roll = math.atan2(-turn[0, 1], turn[1, 1]), math.atan2(-turn[2, 0], turn[2, 2])
     return math.degrees(pan), math.degrees(tilt), math.degrees(roll)
 
 
 def undistort_map(camera: Camera) -> npt.NDArray[np.float32]:
-    """Return s and t, (height, width, 2): where the frame shows what a pinhole shows at each pixel."""
+    """Return s and t, (height, width, 2): the place in the frame of each pixel of an undistorted picture."""
     columns, rows = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
     x, y = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
     points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
@@ -116,7 +116,7 @@ def undistort_map(camera: Camera) -> npt.NDArray[np.float32]:
 
 
 def distort_map(camera: Camera) -> npt.NDArray[np.float32]:
-    """Return s and t, (height, width, 2): where a pinhole shows what the frame shows at each pixel."""
+    """Return s and t, (height, width, 2): the place in an undistorted picture of each pixel of the frame."""
     rays = pixel_rays(camera).astype(np.float64)
     return _coordinates(camera, rays * (camera.fx, camera.fy) + (camera.cx, camera.cy))
 

@@ -1,4 +1,4 @@
-"""Encoders of video: which there are, which of them work here, and how they are asked to encode."""
+"""Video encoders: their names, their availability on this machine, and their options."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.scene.messages import nearest
 
 CODINGS: Final = ("8bit", "10bit", "pq", "hlg")
-"""Codings of video: the camera's codes in 8 or 10 bits, or HDR: BT.2020's primaries in 10 bits."""
+"""Codings of video: the camera's codes with 8 or 10 bits, or HDR with BT.2020 primaries and 10 bits."""
 
 DEFAULT_ENCODERS: Final = {"8bit": "libx264", "10bit": "libx265", "pq": "libx265", "hlg": "libx265"}
 
 CRF: Final = 18
-"""Constant rate factor of x264 and x265 with a hardly visible loss."""
+"""Constant rate factor of x264 and x265, with hardly visible loss."""
 _DEFAULTS: Final[Mapping[str, Mapping[str, str]]] = {
     "libx264": {"preset": "veryfast", "crf": str(CRF)},
     "libx265": {"preset": "veryfast", "crf": str(CRF), "x265-params": "log-level=error"},
@@ -29,42 +29,42 @@ _FORMATS: Final = {
     8: ("yuv420p", "nv12", "yuvj420p", "yuv422p", "yuv444p"),
     10: ("yuv420p10le", "p010le", "yuv422p10le", "yuv444p10le"),
 }
-"""Pixel formats by bits, in order of preference: what most players decode first."""
+"""Pixel formats by bits, the most widely supported by players first."""
 _HARDWARE: Final = ("_nvenc", "_qsv", "_vaapi", "_videotoolbox", "_amf", "_mf", "_v4l2m2m", "_vulkan")
 _AVX2: Final = 11
-"""OpenCV's number of AVX2, ``CPU_AVX2``, which its Python names do not hold."""
+"""OpenCV's number of the CPU feature AVX2, which has no name in Python."""
 _X265_LEARNS: Final = 2
-"""Frames of which x265 tells no decoding times."""
+"""Number of first frames for which x265 gives no valid decoding times."""
 _PROBED: Final = 256
-"""Pixels of a side of the picture that an encoder is tried with; hardware refuses much smaller ones."""
+"""Side in pixels of the test picture for an encoder; hardware refuses much smaller pictures."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Encoding:
-    """Encoding of a video."""
+    """Encoder of a video with its coding and options."""
 
     encoder: str
-    """FFmpeg's name."""
+    """FFmpeg's name of the encoder."""
     pixel_format: str
     coding: str
     """One of ``CODINGS``."""
     options: Mapping[str, str]
-    """The encoder's, the defaults among them."""
+    """Options of the encoder, including defaults."""
 
 
 def find_encoding(
     coding: str = "8bit", encoder: str | None = None, options: Mapping[str, str] | None = None
 ) -> Encoding:
-    """Choose an encoder, and find out whether it works here and knows its options.
+    """Choose an encoder, and check that it works on this machine and has the given options.
 
     Args:
         coding: One of ``CODINGS``.
-        encoder: FFmpeg's name; None: what is usual for the coding.
-        options: The encoder's own, by FFmpeg's names; they go before the defaults.
+        encoder: FFmpeg's name of the encoder; None: the coding's default.
+        options: Options of the encoder, by FFmpeg's names; they override the defaults.
 
     Raises:
-        SinkError: There is no such encoder, it takes no pictures of that depth, or does not work here.
-        UsageError: An option is unknown to it.
+        SinkError: The encoder does not exist, does not support that depth, or does not work on this machine.
+        UsageError: The encoder has no such option.
     """
     name = encoder or DEFAULT_ENCODERS[coding]
     try:
@@ -93,11 +93,11 @@ def find_encoding(
 
 
 def _with_defaults(encoder: str, options: Mapping[str, str]) -> dict[str, str]:
-    """Options of an encoder, the defaults among them; parameters of x264's and x265's own go behind those here.
+    """Return an encoder's options with defaults; given parameters of x264 and x265 are appended to the default ones.
 
-    x264's tree of macroblocks (`mbtree`), in its code for AVX-512, reads memory that nothing has written: at some
-    sizes, 320x240 among them, the same pictures then give other bytes from run to run. Its other code does not, gives
-    the same bytes whatever the processor, and is as fast.
+    x264's macroblock tree (`mbtree`) reads uninitialised memory in its AVX-512 code: at some sizes, such as 320x240,
+    equal pictures give different bytes in each run. Its AVX2 code does not, gives the same bytes on all processors, and
+    is as fast.
     """
     wanted = {**_DEFAULTS.get(encoder, {}), **options}
     key = {"libx264": "x264-params", "libx265": "x265-params"}.get(encoder)
@@ -111,7 +111,7 @@ def _with_defaults(encoder: str, options: Mapping[str, str]) -> dict[str, str]:
 
 
 def _try(encoding: Encoding) -> tuple[str, Sequence[str]]:
-    """Open the encoder as it will be: what goes wrong, in words, and options that it does not know."""
+    """Try to open the encoder; return the error as text, and the options that it does not have."""
     context: Any = av.CodecContext.create(encoding.encoder, "w")
     context.width = context.height = _PROBED
     context.pix_fmt, context.time_base = encoding.pixel_format, fractions.Fraction(1, 30)
@@ -124,15 +124,15 @@ def _try(encoding: Encoding) -> tuple[str, Sequence[str]]:
 
 
 def last_packets(stream: Any, frames: int) -> list[Any]:
-    """Packets that an encoder still held when the frames ended.
+    """Return the packets that an encoder still holds after the last frame.
 
-    x265 learns by how much decoding goes ahead of showing from its third frame. Of shorter clips it tells times that it
-    computed from memory which nothing has written, and what writes files refuses most of them. So few frames are
-    decoded in the order in which they are shown.
+    x265 determines the offset of decoding times from its third frame. For shorter clips its decoding times come from
+    uninitialised memory, and most muxers refuse them. Decoding times are therefore set to display times for so few
+    frames.
 
     Args:
-        stream: PyAV's.
-        frames: Given to it in all.
+        stream: Output stream of PyAV.
+        frames: Total number of frames given to the encoder.
     """
     packets: list[Any] = stream.encode(None)
     if frames <= _X265_LEARNS and stream.codec_context.name == "libx265":
@@ -142,7 +142,7 @@ def last_packets(stream: Any, frames: int) -> list[Any]:
 
 
 def encoder_names() -> list[str]:
-    """Names of the encoders of video that PyAV's FFmpeg was built with."""
+    """Return the names of the video encoders in PyAV's FFmpeg."""
     found = []
     for name in sorted(codecs_available):
         try:
@@ -155,7 +155,7 @@ def encoder_names() -> list[str]:
 
 
 def describe_encoders() -> list[str]:
-    """A line for each encoder that takes frames: its name, its depths, and of hardware whether it works here."""
+    """Return a line for each usable encoder: its name, its bit depths, and for hardware if it works on this machine."""
     lines = []
     for name in encoder_names():
         formats = {known.name for known in av.Codec(name, "w").video_formats or ()}
@@ -172,10 +172,10 @@ def describe_encoders() -> list[str]:
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, str]:
-    """Options of an encoder from ``KEY=VALUE`` each.
+    """Return the encoder options of texts of the form ``KEY=VALUE``.
 
     Raises:
-        UsageError: One is not of that form.
+        UsageError: A text has another form.
     """
     options = {}
     for text in texts:

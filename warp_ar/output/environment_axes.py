@@ -1,8 +1,8 @@
 """Environments in the axes and layouts of other programs, and as spherical harmonics.
 
-A latlong map of this program (``z-up``) has row 0 toward +z and its centre column toward +x, and its columns grow
-toward +y: seen from the ball's place it is a mirror image. Every other latlong here is a picture as it is seen from
-the inside, with the columns growing to the right of who looks at the centre:
+A latlong map of this program (``z-up``) has row 0 toward +z and its centre column toward +x, and its columns advance
+toward +y. Seen from inside, this is a mirror image. The other latlong layouts are pictures as seen from inside, with
+columns advancing to the right:
 
     name      world                            centre column   columns grow toward
     z-up      z up, of the marker              +x              +y
@@ -10,17 +10,18 @@ the inside, with the columns growing to the right of who looks at the centre:
     y-up      y up, (x, z, -y) of the marker   +z              -x
     opengl    the same                         -z              +x
 
-``y-up`` is what OpenEXR means by a latlong and a cube, and USD's dome light takes it. ``blender`` is what Blender's
-world takes; three.js, whose world is that of ``y-up``, shows the same picture in the right place. All four have +z of
-the marker above, so the maps differ by a mirror image and a turn by quarters: texels change places, none is filtered.
+``y-up`` is OpenEXR's convention for latlongs and cubes, and that of USD's dome light. ``blender`` is the convention of
+Blender's world. three.js, whose world is that of ``y-up``, expects the same picture. All four have the marker's +z at
+the top, so the maps differ only by reflection and rotation by quarter turns: texels are permuted, not filtered.
 
 Spherical harmonics are the real orthonormal basis in the order l = 0; l = 1: y, z, x; l = 2: xy, yz, 3z^2 - 1, xz,
 x^2 - y^2, all signs positive (three.js and Filament have the same order and signs). ``radiance`` holds
 
     L_i = integral of L(w) Y_i(w) dw,   L(w) about sum_i L_i Y_i(w),
 
-and ``irradiance`` A_l L_i, with A = pi, 2 pi/3, pi/4 for the clamped cosine ([RH01] eq. 8), so that a surface with the
-normal n receives E(n) = sum_i E_i Y_i(n). Nothing is windowed: beside a small emitter E may come out negative.
+and ``irradiance`` A_l L_i, with A = pi, 2 pi/3, pi/4 for the clamped cosine ([RH01] eq. 8), so that the irradiance of a
+surface with normal n is E(n) = sum_i E_i Y_i(n). The coefficients are not windowed, so E may be negative opposite a
+small emitter.
 
 References:
     OpenEXR, Technical Introduction, Environment Maps, and ``ImfEnvmap``.
@@ -47,17 +48,17 @@ Array = npt.NDArray[np.float64]
 LAYOUTS = ("latlong", "cube")
 
 FACES = ("px", "nx", "py", "ny", "pz", "nz")
-"""Faces of a cube in the order in which they lie, as three.js and others name their files."""
+"""Faces of a cube in their order in a picture, with the names that three.js and others use for files."""
 
 CUBES = {
     "y-up": "cube, faces +x -x +y -y +z -z from the top, y up, each as seen from inside (OpenEXR)",
     "opengl": "cube, faces +x -x +y -y +z -z from the top, y up, each as a face of OpenGL's cube map",
 }
-"""Attribute ``axes`` of a cube."""
+"""Values of the attribute ``axes`` for a cube."""
 BASIS = ("1", "y", "z", "x", "xy", "yz", "3zz-1", "xz", "xx-yy")
-"""Names of the harmonics."""
+"""Names of the harmonic basis functions."""
 LOBE = math.pi * np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
-"""A_l of each harmonic."""
+"""Coefficient A_l of each harmonic."""
 _NORMS = np.sqrt(np.array([1.0, 3.0, 3.0, 3.0, 15.0, 15.0, 1.25, 15.0, 3.75]) / (4.0 * math.pi))
 
 # Along a row, down a column, for +x, -x, +y, -y, +z, -z.
@@ -70,10 +71,10 @@ _SPANS = {
 
 
 def check_axes(axes: str, layout: str = "latlong") -> None:
-    """Check that the axes are known and defined for the layout.
+    """Check that the axes exist and are defined for the layout.
 
     Raises:
-        UsageError: They are not, or there is no such layout.
+        UsageError: The axes or the layout do not exist, or do not fit together.
     """
     if layout not in LAYOUTS:
         raise UsageError(f"layout {layout!r}: expected {' or '.join(LAYOUTS)}")
@@ -83,14 +84,14 @@ def check_axes(axes: str, layout: str = "latlong") -> None:
 
 
 def to_cube(radiance: Radiance, axes: str, size: int | None = None) -> Radiance:
-    """The six faces of a cube, one below the other.
+    """Return the six faces of a cube, one below the other.
 
-    Each texel is the mean of 4 x 4 bilinear samples: a cube of the usual size neither skips a texel nor blurs one.
+    Each texel is the mean of 4 x 4 bilinear samples: at the default size, no texel is skipped or blurred.
 
     Args:
         radiance: Latlong (height, width, 3), z-up.
-        axes: ``y-up`` (faces as OpenEXR has them) or ``opengl`` (as OpenGL's cube maps have them).
-        size: Texels along an edge; None means half the map's rows, for like texels at the centre of a face.
+        axes: ``y-up`` (OpenEXR's faces) or ``opengl`` (faces of OpenGL's cube maps).
+        size: Texels along an edge; None means half the map's rows, for equal texel sizes at the centre of a face.
 
     Returns:
         (6 size, size, 3), in the order +x, -x, +y, -y, +z, -z.
@@ -115,7 +116,7 @@ def to_cube(radiance: Radiance, axes: str, size: int | None = None) -> Radiance:
 
 
 def cube_directions(axes: str, size: int, dy: float = 0.5, dx: float = 0.5) -> Array:
-    """Directions, not unit, in a file's world at a place within each texel of a cube, (6, size, size, 3)."""
+    """Return unnormalized directions, in a file's world, within each texel of a cube, (6, size, size, 3)."""
     check_axes(axes, "cube")
     right = ((np.arange(size) + dx) / size * 2.0 - 1.0)[None, :, None]
     down = ((np.arange(size) + dy) / size * 2.0 - 1.0)[:, None, None]
@@ -124,7 +125,7 @@ def cube_directions(axes: str, size: int, dy: float = 0.5, dx: float = 0.5) -> A
 
 
 def sample_latlong(radiance: Radiance, directions: Array) -> Array:
-    """Bilinear samples of a z-up latlong, continuous across seam and poles.
+    """Return bilinear samples of a z-up latlong, continuous across seam and poles.
 
     Args:
         radiance: (height, width, 3).
@@ -141,7 +142,7 @@ def sample_latlong(radiance: Radiance, directions: Array) -> Array:
     down, right = (row - top)[..., None], (column - left)[..., None]
 
     def at(rows: npt.NDArray[np.int_], columns: npt.NDArray[np.int_]) -> Array:
-        # Beyond a pole lies the same row, half a turn away.
+        # Beyond a pole, the same row continues half a turn away.
         beyond = (rows < 0) | (rows >= height)
         columns = np.where(beyond, columns + width // 2, columns) % width
         return np.asarray(radiance[np.clip(rows, 0, height - 1), columns], np.float64)
@@ -154,12 +155,13 @@ def sample_latlong(radiance: Radiance, directions: Array) -> Array:
 def project_radiance(radiance: Radiance, axes: str = "z-up") -> Array:
     """Return the coefficients L_i of a latlong, (9, 3).
 
-    A texel's radiance is constant, and Y_i a product of functions of theta and phi: its integral is one over the
-    columns (a closed form) times one over the rows (Gauss-Legendre over theta with 8 points, exact to rounding).
+    The radiance of a texel is constant, and Y_i is a product of functions of theta and phi. Its integral is the product
+    of an integral over the columns (in closed form) and one over the rows (Gauss-Legendre over theta with 8 points,
+    exact to rounding).
 
     Args:
         radiance: (height, width, 3), z-up.
-        axes: One of ``AXES``, whose x, y and z the basis is told in.
+        axes: One of ``AXES``; the basis functions use its x, y and z.
 
     Raises:
         UsageError: There are no such axes.
@@ -174,7 +176,8 @@ def project_radiance(radiance: Radiance, axes: str = "z-up") -> Array:
     sin, cos = np.sin(phi), -np.cos(phi)
     columns = np.diff(np.stack([phi, cos, phi, sin, -np.cos(2 * phi) / 4, cos, phi, sin, np.sin(2 * phi) / 2]))
     own = _NORMS[:, None] * np.einsum("kh,hwc,kw->kc", rows, radiance.astype(np.float64), columns, optimize=True)
-    # What Y is of turned directions is linear in what it is of these; any nine in general position tell how.
+    # The basis of rotated directions is linear in the basis of the original ones; nine directions in general position
+    # determine the matrix.
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     turned, *_ = np.linalg.lstsq(basis(directions), basis(directions @ world_from_marker(axes).T), rcond=None)
@@ -189,11 +192,11 @@ def basis(directions: Array) -> Array:
 
 
 def encode_harmonics(radiance: Radiance, axes: str, white_level: float) -> bytes:
-    """Return the JSON of a latlong's harmonics.
+    """Return a latlong's harmonics as JSON.
 
     Args:
         radiance: (height, width, 3), z-up.
-        axes: As of `project_radiance`.
+        axes: As in `project_radiance`.
         white_level: Value at which the camera clips.
 
     Raises:

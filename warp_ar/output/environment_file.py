@@ -1,12 +1,13 @@
-"""Environments as files: OpenEXR, Radiance's HDR, or spherical harmonics in JSON; one, or one per frame.
+"""Environments as files: OpenEXR, Radiance HDR, or spherical harmonics in JSON; one file, or one per frame.
 
-An OpenEXR says how it is to be read. ``axes`` (a sentence of `environment_axes`), ``chromaticities`` (of sRGB's
-primaries) and ``whiteLevel`` (the value at which the camera clips) are always there; ``envmap`` wherever the picture is
-one that is seen from inside, so in all axes but ``z-up``. Where it is known: ``whiteLuminance`` (cd/m^2 of the value
-1), ``exposure`` (t ISO / (100 N^2)), ``capDate`` with ``utcOffset``, and ``longitude``, ``latitude``, ``altitude``.
+An OpenEXR contains metadata. Always present are ``axes`` (a sentence of `environment_axes`), ``chromaticities`` (of
+sRGB's primaries) and ``whiteLevel`` (the value at which the camera clips). ``envmap`` is present for pictures as seen
+from inside, which are all axes except ``z-up``. If known, there are ``whiteLuminance`` (luminance in cd/m^2 of the
+value 1), ``exposure`` (t ISO / (100 N^2)), ``capDate`` with ``utcOffset``, and ``longitude``, ``latitude``,
+``altitude``.
 
-Texel centres are at half-integers, as renderers sample them. OpenEXR's own functions have the outermost centres lie at
-the poles and edges: half a texel at most.
+Texel centres are at half-integers, as in renderers. OpenEXR's own functions place the outermost centres at the poles
+and edges, which differs by at most half a texel.
 """
 
 from __future__ import annotations
@@ -44,22 +45,22 @@ _REC_709_WORDS = " ".join(f"{value:.4f}" for value in REC_709)
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr", ".json")
 
 _SATURATION = 1.2
-"""Luminance at which a camera clips, cd/m^2, times t ISO / (100 N^2): by the saturation-based speed of ISO 12232,
-78 / (100 q) with the usual q = 0.65 of lens and angle."""
+"""Luminance in cd/m^2 at which a camera clips, times t ISO / (100 N^2): by the saturation-based speed of ISO 12232, 78
+/ (100 q) with the usual factor q = 0.65 for lens and angle."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentInfo:
-    """Metadata of an environment beside its radiance."""
+    """Metadata of an environment."""
 
     white_level: float = 1.0
     """Value at which the camera clips."""
     white_luminance: float | None = None
-    """cd/m^2 of the value 1; None where it is not known."""
+    """Luminance in cd/m^2 of the value 1; None if unknown."""
     exposure: float | None = None
-    """t ISO / (100 N^2), with t in seconds; None where it is not known."""
+    """Exposure t ISO / (100 N^2), with t in seconds; None if unknown."""
     taken: datetime.datetime | None = None
-    """When it was captured, with its time zone."""
+    """Time of capture, with time zone."""
     place: tuple[float, float, float] | None = None
     """Longitude and latitude in degrees, east and north positive, and altitude in metres."""
 
@@ -79,13 +80,13 @@ class EnvironmentInfo:
                 )
 
     def luminance_of_one(self) -> float | None:
-        """cd/m^2 of the value 1: as given, or by the exposure; None if neither is known."""
+        """Return the luminance in cd/m^2 of the value 1: as given, or by the exposure; None if both are unknown."""
         if self.white_luminance is not None or self.exposure is None:
             return self.white_luminance
         return _SATURATION / self.exposure / self.white_level
 
     def attributes(self) -> dict[str, Any]:
-        """Return what is known as attributes of an OpenEXR."""
+        """Return the known metadata as attributes of an OpenEXR."""
         known: dict[str, Any] = {
             "whiteLevel": self.white_level,
             "whiteLuminance": self.luminance_of_one(),
@@ -111,26 +112,26 @@ def write_environment(
     info: EnvironmentInfo | None = None,
     color_space: str = "rec709",
 ) -> None:
-    """Write an environment as the ending of ``path`` says.
+    """Write an environment in the format of the suffix of ``path``.
 
-    ``.hdr`` is Radiance's, whose values are right to 1 part in 256 of a texel's brightest channel and never negative.
+    ``.hdr`` is Radiance HDR, whose values are exact to 1/256 of a texel's brightest channel and never negative.
     ``.json`` holds spherical harmonics, see `environment_harmonics`. Any other ending is OpenEXR, 32-bit float,
     ZIP-compressed, channels R, G, B.
 
     Args:
-        path: The file; folders that are missing on the way are made.
-        radiance: Linear RGB in camera values, float32, (height, width, 3); row 0 looks toward +z, the centre column
-            toward +x, columns grow toward +y.
-        overwrite: Whether a file that this program did not write may be replaced.
-        axes: What the file's directions are told in: one of ``AXES`` of `environment_axes`.
+        path: The file; missing parent folders are made.
+        radiance: Linear RGB in camera values, float32, (height, width, 3); row 0 is toward +z, the centre column toward
+            +x, and columns advance toward +y.
+        overwrite: True to replace a file that this program did not write.
+        axes: Axes of the file's directions: one of ``AXES`` of `environment_axes`.
         layout: ``latlong``, or ``cube``: six faces, one below the other.
         size: Texels along an edge of a cube; None means half the map's rows.
-        info: What else is known; HDR holds nothing of it, JSON the white level.
-        color_space: One of ``COLOR_SPACES``; another than ``rec709`` only in OpenEXR.
+        info: Metadata; HDR stores none, JSON only the white level.
+        color_space: One of ``COLOR_SPACES``; spaces other than ``rec709`` are for OpenEXR only.
 
     Raises:
-        SinkError: The array is of another kind, or the file cannot be written or may not be replaced.
-        UsageError: The axes, the layout, the size or the colour space cannot be used.
+        SinkError: The array is invalid, or the file cannot be written or must not be replaced.
+        UsageError: The axes, the layout, the size or the colour space is invalid.
     """
     path = pathlib.Path(path)
     info = EnvironmentInfo() if info is None else info
@@ -156,7 +157,7 @@ def write_environment(
             if layout == "cube":
                 header["envmap"] = OpenEXR.ENVMAP_CUBE
             elif axes != "z-up":
-                # By OpenEXR's word the picture is seen from inside; who believed it of a mirror image would mirror it.
+                # OpenEXR defines the picture as seen from inside; readers that rely on it would flip a mirror image.
                 header["envmap"] = OpenEXR.ENVMAP_LATLONG
             image = OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)})
             data = functools.partial(write_exr, image=image)
@@ -173,7 +174,7 @@ def read_environment(path: str | pathlib.Path, *, axes: str | None = None) -> np
 
     Args:
         path: The file.
-        axes: One of ``AXES`` of `environment_axes`; None: as the file says, else by the convention of its format.
+        axes: One of ``AXES`` of `environment_axes`; None: as stated in the file, else the convention of its format.
 
     Raises:
         SinkError: The file is missing, another kind of file, a cube, or has no R, G and B.
@@ -192,7 +193,7 @@ def read_environment_info(path: str | pathlib.Path) -> EnvironmentInfo:
     """Read an environment's metadata from the header of an OpenEXR.
 
     Raises:
-        SinkError: The file cannot be read, or its header holds a date or place that is none.
+        SinkError: The file cannot be read, or its header has an invalid date or place.
     """
     path = pathlib.Path(path)
     header = {} if path.suffix.lower() == ".hdr" else read_exr_header(path, SinkError, str(path))
@@ -226,32 +227,32 @@ def check_environment(radiance: npt.NDArray[Any]) -> None:
     """Check that an array is an environment.
 
     Raises:
-        SinkError: It is none.
+        SinkError: The array is no environment.
     """
     if radiance.dtype != np.float32 or radiance.ndim != 3 or radiance.shape[2] != 3 or not radiance.size:
         raise SinkError(f"an environment is float32 (height, width, 3), not {radiance.dtype} {radiance.shape}")
 
 
 def encode_hdr(radiance: npt.NDArray[np.float32], axes: str) -> bytes:
-    """The file's bytes, its scanlines not run-length encoded: those of a camera hardly repeat.
+    """Return the bytes of a Radiance HDR without run-length encoding, because camera pictures hardly repeat.
 
-    Channels are right to half a step, 1 part in 256 of a texel's brightest channel at most. What is negative or no
-    number becomes 0, what is infinite the largest value.
+    Channels are exact to half a step, at most 1/256 of a texel's brightest channel. Negative values and NaN become 0,
+    infinity becomes the largest value.
 
     Args:
         radiance: Linear RGB, (height, width, 3), row 0 at the top.
-        axes: What the header says of the directions.
+        axes: Description of the directions for the header.
     """
     height, width = radiance.shape[:2]
     values = np.clip(np.nan_to_num(radiance.astype(np.float64), nan=0.0, posinf=1e38), 0.0, 1e38)
     brightest = values.max(2)
     exponent = np.frexp(brightest)[1]
-    # 256 after rounding needs the next exponent.
+    # A mantissa that rounds to 256 needs the next exponent.
     exponent += np.rint(np.ldexp(brightest, 8 - exponent)) > 255
     mantissas = np.rint(np.ldexp(values, (8 - exponent)[..., None]))
     seen = (brightest > 0.0) & (exponent > -128)
     pixels = np.concatenate([mantissas, (exponent + 128)[..., None]], 2) * seen[..., None]
-    # Readers of some programs expect FORMAT on the header's last line.
+    # Some readers expect FORMAT on the header's last line.
     header = [
         *("#?RADIANCE", f"SOFTWARE={PROGRAM}", f"VIEW_AXES={axes}", f"PRIMARIES={_REC_709_WORDS}"),
         *("FORMAT=32-bit_rle_rgbe", "", f"-Y {height} +X {width}", ""),
@@ -260,7 +261,7 @@ def encode_hdr(radiance: npt.NDArray[np.float32], axes: str) -> bytes:
 
 
 def convert_light(radiance: Radiance, source: str, target: str) -> Radiance:
-    """Return linear light, (height, width, 3), in another colour space of ``COLOR_SPACES``, its white adapted.
+    """Convert linear light, (height, width, 3), between colour spaces of ``COLOR_SPACES``, with white adaptation.
 
     Raises:
         UsageError: There is no such space.
@@ -272,15 +273,15 @@ def convert_light(radiance: Radiance, source: str, target: str) -> Radiance:
 
 
 def grey_card_scale(radiance: Radiance) -> float:
-    """Factor on an environment under which a grey card that lies on the marker has a luminance of 0.18.
+    """Return the factor on an environment under which a grey card lying on the marker has a luminance of 0.18.
 
-    The card is Lambertian: its radiance is 0.18 E / pi, with the irradiance E of a surface that faces up.
+    The card is Lambertian: its radiance is 0.18 E / pi, with the irradiance E of a surface facing up.
 
     Args:
         radiance: Latlong (height, 2 height, 3), z-up.
 
     Raises:
-        UsageError: Nothing comes from above.
+        UsageError: There is no light from above.
     """
     height = len(radiance)
     cos_theta = np.clip(latlong_directions(height)[..., 2], 0.0, None) * texel_solid_angles(height)

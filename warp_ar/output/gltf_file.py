@@ -1,10 +1,10 @@
-"""A shot as binary glTF 2.0 (``.glb``), with KHR_lights_punctual and EXT_lights_image_based.
+"""Export of a shot as binary glTF 2.0 (``.glb``), with KHR_lights_punctual and EXT_lights_image_based.
 
-glTF is y-up: the node ``shot`` turns the marker's world, z up, and everything else stands below it as in the scene. A
-camera of glTF looks at its picture's middle and has square pixels but for its aspect; what it cannot say, and the
-lens's distortion, stand in its ``extras``, as does the file of the environment in those of the asset. Intensities are
-told as candela and lux of camera values: a white surface that faces a light of intensity I at distance d has radiance
-I / (pi d^2).
+glTF is y-up: the node ``shot`` rotates the marker's z-up world, and all other nodes are below it. A glTF camera has a
+central principal point and square pixels except for its aspect ratio. Parameters that it cannot express, including lens
+distortion, are in the camera's ``extras``; the environment's file name is in the asset's ``extras``. Intensities in
+candela and lux hold camera values: a white surface that faces a light of intensity I at distance d has radiance I / (pi
+d^2).
 
 References:
     Khronos Group, "glTF 2.0 Specification", KHR_lights_punctual, KHR_materials_specular,
@@ -36,13 +36,13 @@ _FLOAT, _INDEX = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
-"""Quaternion, x first, that turns z up to y up."""
+"""Quaternion (x, y, z, w) that rotates z up to y up."""
 _EVEN = 1e-6
-"""Relative difference of the axes' lengths below which a placement is a turn and one scale for all frames."""
+"""Relative difference of the axes' lengths below which a placement counts as rotation with uniform scale."""
 _WRAPS = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
 _NEAREST, _LINEAR, _TRILINEAR = 9728, 9729, 9987
 _DIELECTRIC = 0.04
-"""Reflectance straight on of what is no metal."""
+"""Reflectance of non-metals at normal incidence."""
 
 
 def write_glb(path: Path, shot: Shot) -> list[Path]:
@@ -59,7 +59,7 @@ def write_glb(path: Path, shot: Shot) -> list[Path]:
 
 
 def quaternions(rotations: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return unit quaternions, x first, of rotations (n, 3, 3), each on the side of the one before."""
+    """Return unit quaternions (x, y, z, w) of rotations (n, 3, 3), with signs chosen for continuity."""
     padded = np.tile(np.eye(4), (len(rotations), 1, 1))
     padded[:, :3, :3] = rotations
     found = np.array([np.roll(quaternion_from_matrix(matrix, isprecise=True), -1) for matrix in padded])
@@ -68,7 +68,7 @@ def quaternions(rotations: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 class _Builder:
-    """Collects nodes, accessors and bytes."""
+    """Collector of nodes, accessors and binary data."""
 
     def __init__(self, shot: Shot) -> None:
         self._shot = shot
@@ -96,7 +96,7 @@ class _Builder:
             self._add_environment(shot.radiance)
 
     def encode(self) -> bytes:
-        """Return the file."""
+        """Return the bytes of the file."""
         if self._animation["channels"]:
             self._tree["animations"] = [self._animation]
         self._tree["buffers"] = [{"byteLength": len(self._bytes)}]
@@ -107,7 +107,7 @@ class _Builder:
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
     def _add(self, kind: str, entry: Any, *, once: bool = False) -> int:
-        """Add an entry to a list of the tree; returns its index, with ``once`` that of an equal one."""
+        """Add an entry to a list of the tree and return its index; with ``once``, an equal entry is reused."""
         entries = self._tree.setdefault(kind, [])
         if once and entry in entries:
             return int(entries.index(entry))
@@ -138,7 +138,7 @@ class _Builder:
         return self._add("accessors", entry)
 
     def _add_node(self, node: dict[str, Any], placements: dict[int, Matrix]) -> None:
-        """Add a node below the root, placed by its frames."""
+        """Add a node below the root, with its placements by frame."""
         self._tree["nodes"][0]["children"].append(self._add("nodes", node))
         if not placements:
             return
@@ -151,11 +151,11 @@ class _Builder:
                 node["scale"] = [scale] * 3
             self._set_keys(node, placements, {**moved, "rotation": quaternions(matrices[:, :3, :3] / scale)})
             return
-        # Any linear map is U S V^T: a node turns by V^T, and one above it, in its place in the tree, by U S.
+        # Any linear map is U S V^T: a node is rotated by V^T, and a parent node in its place by U S.
         inner = {"name": f"{node['name']}_inner", "mesh": node.pop("mesh")}
         node["children"] = [self._add("nodes", inner)]
         outer, scales, turned = np.linalg.svd(matrices[:, :3, :3])
-        # Both must be rotations: a mirror goes into the last scale.
+        # Both must be rotations: a reflection goes into the last scale.
         signs, turned_signs = np.sign(np.linalg.det(outer)), np.sign(np.linalg.det(turned))
         outer[:, :, 2] *= signs[:, None]
         turned[:, 2, :] *= turned_signs[:, None]
@@ -166,7 +166,7 @@ class _Builder:
     def _set_keys(
         self, node: dict[str, Any], placements: dict[int, Matrix], values: dict[str, npt.NDArray[Any]]
     ) -> None:
-        """Place a node, and move it by keyframes where there are several."""
+        """Set a node's placement, with keyframes if there are several."""
         node.update({path: keys[0].tolist() for path, keys in values.items()})
         if len(placements) < 2:
             return
@@ -204,7 +204,7 @@ class _Builder:
         }
         for name, coordinates in (("TEXCOORD_0", mesh.uvs), ("TEXCOORD_1", mesh.uvs_second)):
             if coordinates is not None:
-                # v runs down the picture.
+                # v points down in glTF.
                 attributes[name] = self._accessor(coordinates * np.array([1.0, -1.0]) + np.array([0.0, 1.0]), _VERTICES)
         if mesh.tangents is not None and any("normal" in material.pictures for material in body.materials):
             attributes["TANGENT"] = self._accessor(mesh.tangents, _VERTICES)
@@ -246,12 +246,12 @@ class _Builder:
         if own.unlit:
             self._extend(entry, "KHR_materials_unlit", {})
         if any(own.emission):
-            # Factors go to 1 at most; what is beyond is the strength's.
+            # Factors are at most 1; the strength extension takes the rest.
             entry["emissiveFactor"] = _bounded(own.emission)
             if max(own.emission) > 1.0:
                 self._extend(entry, "KHR_materials_emissive_strength", {"emissiveStrength": max(own.emission)})
         if material.specular is not None:
-            # A factor goes to 1 at most; what is beyond is the colour's, which may be any.
+            # A factor is at most 1; the colour, which is unbounded, takes the rest.
             strength = min(1.0, max(material.specular) / _DIELECTRIC)
             color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in material.specular]
             told = {"specularFactor": strength, "specularColorFactor": color}
@@ -259,7 +259,7 @@ class _Builder:
         return self._add("materials", entry)
 
     def _texture(self, picture: Picture) -> dict[str, Any]:
-        """Return a reference to a picture with its sampler and its place; equal pictures are held once."""
+        """Return a reference to a picture with its sampler and texture transform; equal pictures are stored once."""
         use = picture.use
         wrap_s, wrap_t = (_WRAPS[wrap] for wrap in use.wrap)
         magnified = _NEAREST if use.nearest else _LINEAR
@@ -272,7 +272,7 @@ class _Builder:
         if use.uv_set:
             made["texCoord"] = use.uv_set
         if use.transform != IDENTITY:
-            # Here v runs down.
+            # v points down in glTF.
             across, up, turn, c, f = picture.placing
             offset = [c + use.transform[1], 1.0 - use.transform[4] - f]
             self._extend(made, "KHR_texture_transform", {"offset": offset, "rotation": turn, "scale": [across, up]})
@@ -308,6 +308,6 @@ class _Builder:
 
 
 def _bounded(color: Sequence[float]) -> list[float]:
-    """Return a colour within 0..1; the light's intensity has taken its largest channel."""
+    """Return a colour within 0..1; its largest channel is part of the light's intensity."""
     most = max(1.0, *color)
     return [value / most for value in color]

@@ -1,16 +1,16 @@
-"""Layers of frames as files: one OpenEXR of several parts per frame, and PNGs of those layers that PNG can hold.
+"""Layers of frames as files: a multi-part OpenEXR per frame, and PNGs of layers that PNG can store.
 
     picture = (1 - alpha) max(plate * shadow_ratio + added_light + mirror_ball, 0) + objects
     code = encode(exposureScale * picture)
 
-The first part, ``picture``, is that sum as linear radiance, there where all five layers are. Radiance and ratios are
-16-bit floats, as compositors expect; depth, positions, motion and numbers of surfaces have 32 bits. A part is named as
-its layer, and so are its channels (``objects.R``), but for those that OpenEXR names itself: ``R``, ``G``, ``B``, ``A``
-of the picture and ``Z`` of the depth. ``coverage`` becomes Cryptomatte's ``CryptoObject``: a name's hash as a float,
-and a manifest that tells names by hashes [Cry].
+The first part, ``picture``, is that sum as linear radiance, present if all five layers are. Radiance and ratios are
+16-bit floats, as compositors expect; depth, positions, motion and surface numbers have 32 bits. Parts and channels have
+the layer's name (``objects.R``), except for OpenEXR's standard names: ``R``, ``G``, ``B``, ``A`` of the picture and
+``Z`` of the depth. ``coverage`` becomes Cryptomatte's ``CryptoObject``: a name's hash as a float, and a manifest of
+names by hash [Cry].
 
-PNGs lie in a folder per layer: the plate in the codes of the camera; numbers of surfaces, 1 more than in ``ids``, 0 for
-none; depth in tenths of a millimetre, 0 where there is nothing or it is beyond 6.5535 m; normals as 32767.5 (n + 1).
+PNGs are in a folder per layer: the plate in the camera's codes; surface numbers, 1 more than in ``ids``, 0 for none;
+depth in tenths of a millimetre, 0 for none or beyond 6.5535 m; normals as 32767.5 (n + 1).
 
 References:
     [Cry] Friedman, Jones, "Cryptomatte Specification" 1.2, Psyop, 2016.
@@ -47,13 +47,13 @@ from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
 Layers = Mapping[str, npt.NDArray[Any]]
 
 PICTURES = ("plate", "ids", "depth", "normals")
-"""Layers that PNG can hold."""
+"""Layers that PNG can store."""
 DEPTH_STEP = 1e-4
 """Metres per step of a depth in a PNG."""
 MATTES = "CryptoObject"
-"""Name of the layer of mattes."""
+"""Name of the Cryptomatte layer."""
 
-# Channels of a layer that are not R, G and B, and whether they have 32 bits.
+# Channels of a layer that are not R, G and B, and True if they have 32 bits.
 _CHANNELS: dict[str, tuple[tuple[str, ...], type]] = {
     "depth": (("Z",), np.float32),
     "ids": (("ids.I",), np.uint32),
@@ -67,22 +67,22 @@ _CHANNELS: dict[str, tuple[tuple[str, ...], type]] = {
 
 @dataclasses.dataclass(frozen=True)
 class LayerFrame:
-    """One frame's layers, and what a file of them says beside."""
+    """Layers of one frame, with metadata for a file."""
 
     layers: Layers
-    """Layers by the names of ``LAYERS``."""
+    """Layers by name; the names are those of ``LAYERS``."""
     frame: npt.NDArray[np.uint8]
     """The camera's frame, RGB."""
     names: tuple[str, ...]
-    """Names of the surfaces, by number."""
+    """Names of the surfaces, by surface number."""
     exposure_scale: float = 1.0
     """Factor on the composed radiance in the picture."""
     transfer: str = "srgb"
     """Transfer function by which the picture encodes radiance."""
     camera_from_world: npt.NDArray[np.float64] | None = None
-    """(4, 4), camera axes x right, y down, z forward, metres; None where it is not known."""
+    """``camera_from_world``, (4, 4), camera axes x right, y down, z forward, metres; None if unknown."""
     camera_matrix: npt.NDArray[np.float64] | None = None
-    """(3, 3), pixels, their centres at integers."""
+    """Camera matrix, (3, 3), in pixels with centres at integers."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -90,7 +90,7 @@ class LayerFrame:
         return self.frame.shape
 
     def copy(self) -> LayerFrame:
-        """One whose frame may outlast the source's; layers are a result's own copies."""
+        """Return a copy with a frame of its own, because the source may reuse the frame's memory."""
         return dataclasses.replace(self, frame=self.frame.copy())
 
 
@@ -123,16 +123,16 @@ def _part(name: str, channels: dict[str, Any], frame: LayerFrame, more: Mapping[
     header = exr_header(chromaticities=REC_709, exposureScale=scale, transfer=frame.transfer, **more)
     if frame.camera_from_world is not None:
         header["cameraFromWorld"] = frame.camera_from_world.astype(np.float32)
-        # OpenEXR's own attribute maps rows, to a camera that looks along its -z with y up.
+        # OpenEXR's standard attribute is for row vectors, and a camera that faces -z with y up.
         rows = (np.diag([1.0, -1.0, -1.0, 1.0]) @ frame.camera_from_world).T
-        header["worldToCamera"] = np.ascontiguousarray(rows, np.float32)  # it is written as it lies in memory
+        header["worldToCamera"] = np.ascontiguousarray(rows, np.float32)  # written in memory order
     if frame.camera_matrix is not None:
         header["cameraMatrix"] = frame.camera_matrix.astype(np.float32)
     return OpenEXR.Part(header, channels, name)
 
 
 def murmur3(data: bytes) -> int:
-    """Return MurmurHash3 x86 of bytes, 32 bits, seed 0."""
+    """Return the 32-bit MurmurHash3 (x86) of bytes, seed 0."""
     mask = 0xFFFFFFFF
     state, whole = 0, len(data) // 4 * 4
     for at in (*range(0, whole, 4), *[whole] * (len(data) > whole)):
@@ -147,13 +147,13 @@ def murmur3(data: bytes) -> int:
 
 
 def matte_bits(name: str) -> int:
-    """Return the bits of a name's float: its hash, kept off denormal, infinite and NaN ones [Cry]."""
+    """Return the bits of a name's float: its hash, changed to avoid denormal, infinite and NaN values [Cry]."""
     bits = murmur3(name.encode())
     return bits ^ 1 << 23 if bits >> 23 & 255 in (0, 255) else bits
 
 
 def matte_header(names: Sequence[str]) -> Mapping[str, str]:
-    """Return attributes of an OpenEXR that holds the mattes of surfaces of these names."""
+    """Return the OpenEXR attributes for mattes of surfaces with these names."""
     key = f"cryptomatte/{murmur3(MATTES.encode()):08x}"[: len("cryptomatte/") + 7]
     manifest = {name: f"{matte_bits(name):08x}" for name in names}
     return {
@@ -169,9 +169,9 @@ def matte_channels(coverage: npt.NDArray[np.float32], names: Sequence[str]) -> d
 
     Args:
         coverage: (height, width, 2 n) number of a surface (-1: none) and its share in turn, as the layer ``coverage``.
-        names: Of the surfaces, by number.
+        names: Names of the surfaces, by number.
     """
-    hashes = np.array([*map(matte_bits, names), 0], np.uint32).view(np.float32)  # the last for -1
+    hashes = np.array([*map(matte_bits, names), 0], np.uint32).view(np.float32)  # the last entry is for -1
     channels: dict[str, npt.NDArray[np.float32]] = {}
     for rank in range(coverage.shape[2] // 2):
         which, share = coverage[..., 2 * rank], coverage[..., 2 * rank + 1]
@@ -201,11 +201,11 @@ class LayerSink(FolderSink):
 
     Args:
         path: The folder.
-        overwrite: Whether numbered files that this program did not write may go.
+        overwrite: True to replace numbered files that this program did not write.
         pictures: Names of layers to write as PNG, of ``PICTURES``.
 
     Raises:
-        SinkError: A folder cannot be made or written to, or holds files that may not go.
+        SinkError: A folder cannot be made or written to, or holds files that must not be replaced.
     """
 
     _suffix = ".exr"
@@ -228,7 +228,7 @@ class LayerSink(FolderSink):
 
 
 def parse_layers(text: str | None) -> tuple[str, ...]:
-    """Return names of layers, separated by commas; None or ``all`` means every one.
+    """Return the names of layers in a comma-separated text; None or ``all`` means all layers.
 
     Raises:
         UsageError: A name is unknown, or there is none.
@@ -243,7 +243,7 @@ def parse_layers(text: str | None) -> tuple[str, ...]:
 
 
 class SideFiles(Closing):
-    """Folders of what is written of every frame beside the picture: the captured light, and the layers."""
+    """Folders with further outputs of every frame: the captured light, and the layers."""
 
     def __init__(
         self,
@@ -261,18 +261,18 @@ class SideFiles(Closing):
                 whose light is interpolated, the first one's lies in it, those of the others in folders ``ball_1`` and
                 so on below it.
             layers: Folder for layers; None: they are not written.
-            names: Which layers.
-            pictures: Whether layers that PNG can hold are written as PNG besides.
-            overwrite: Whether numbered files that this program did not write may be replaced.
+            names: Names of the layers.
+            pictures: True to write layers that PNG can store as PNG as well.
+            overwrite: True to replace numbered files that this program did not write.
 
         Raises:
             SinkError: A folder cannot be written to.
         """
         self._stack = contextlib.ExitStack()
         self.outputs: tuple[str, ...] = ()
-        """Outputs that the pipeline's results must hold."""
+        """Outputs that the pipeline's results must contain."""
         self._lights: list[EnvironmentSink] = []
-        """Take the captured light, of one mirror ball each; all but the first are opened where there is some."""
+        """Sinks of the captured light, one per mirror ball; all but the first are opened when needed."""
         self._environment, self._overwrite = environment, overwrite
         self._layers: LayerSink | None = None
         with contextlib.ExitStack() as stack:
@@ -287,27 +287,27 @@ class SideFiles(Closing):
 
     @property
     def replaced(self) -> tuple[str, ...]:
-        """Words for what the first frame replaces."""
+        """Return a description of the files that the first frame replaces."""
         return tuple(sink.replaced for sink in (*self._lights[:1], self._layers) if sink and sink.replaced)
 
     @property
     def written(self) -> str:
-        """Words for how much is stored, which begin with a comma; empty where nothing is asked for."""
+        """Return a description of the stored files, beginning with a comma; empty without outputs."""
         lights = f", and {self._lights[0].written} environments" if self._lights else ""
         if len(self._lights) > 1:
             lights += f" of each of {len(self._lights)} mirror balls"
         return lights if self._layers is None else f"{lights}, and layers of {self._layers.written}"
 
     def write(self, frame: npt.NDArray[np.uint8], result: Result, scene: Scene) -> None:
-        """Take the next frame.
+        """Write the next frame.
 
         Args:
             frame: The camera's, uint8 RGB (height, width, 3).
-            result: What it became.
-            scene: As it was lit, its camera of the frame's size.
+            result: Result of the frame.
+            scene: Scene as it was lit, with the camera at the frame's size.
 
         Raises:
-            SinkError: An earlier one could not be written.
+            SinkError: An earlier frame could not be written.
         """
         if self._environment is not None and result.environment is not None:
             for ball, radiance in enumerate(result.environments):
@@ -324,7 +324,7 @@ class SideFiles(Closing):
 
 
 def layer_frame(frame: npt.NDArray[np.uint8], result: Result, scene: Scene) -> LayerFrame:
-    """The layers of a result as files take them; arguments as those of `SideFiles.write`."""
+    """Return a result's layers for a file; arguments are those of `SideFiles.write`."""
     camera = scene.camera.scaled_to(frame.shape[1], frame.shape[0])
     from_world: Any = None
     if result.pose is not None:

@@ -1,7 +1,7 @@
-"""Rules for places of output: never onto what is read, and onto a file of somebody else's only if that is allowed.
+"""Rules for output files: inputs are never overwritten, and other programs' files only on request.
 
-What this program wrote, by its signature, is replaced, and the sink says that it was; any other file is left alone
-unless overwriting is asked for.
+A file written by this program, recognised by its signature, is replaced with a note. Any other file is kept unless
+overwriting is requested.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ _NUMBERED = re.compile(r"[0-9]{4,}\.(png|exr)")
 
 
 def check_replaceable(path: Path, *, overwrite: bool) -> str:
-    """Find out whether a file may be written.
+    """Check that a file may be written.
 
     Args:
         path: The file.
-        overwrite: Whether a file that this program did not write may be replaced.
+        overwrite: True to replace a file that this program did not write.
 
     Returns:
-        What is lost, in words; empty where that is nothing.
+        Description of the file that is replaced; empty if there is none.
 
     Raises:
-        SinkError: It may not be, or is no regular file.
+        SinkError: The file must not be replaced, or is no regular file.
     """
     try:
         kind = kind_of(path)
@@ -56,7 +56,7 @@ def check_replaceable(path: Path, *, overwrite: bool) -> str:
 
 
 def earlier_frames(folder: Path, suffix: str, *, overwrite: bool) -> list[Path]:
-    """Numbered frames that an earlier run left in a folder, and that a new one must not stand beside.
+    """Return the numbered frames of an earlier run in a folder, which must be removed before a new run.
 
     Raises:
         SinkError: This program did not write one of them, and ``overwrite`` is not asked for.
@@ -77,14 +77,14 @@ def earlier_frames(folder: Path, suffix: str, *, overwrite: bool) -> list[Path]:
 
 
 def check_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]) -> None:
-    """See to it that nothing is written over what is read, or twice.
+    """Check that no output overwrites an input or another output.
 
     Args:
-        reads: Files and folders that are read, by what they are ("--source").
-        writes: Files and folders that are to be written, by what asks for them ("--output").
+        reads: Files and folders that are read, by option or role ("--source").
+        writes: Files and folders that are written, by option ("--output").
 
     Raises:
-        UsageError: Two are one, by whatever links, or a numbered frame would be one of the others.
+        UsageError: Two paths are the same file, also by links, or a numbered frame would be one of the others.
     """
     entries = [(role, path) for role, paths in reads.items() for path in paths]
     for written, place in writes.items():
@@ -99,15 +99,15 @@ def check_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]
 
 
 def claim_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path], *, overwrite: bool) -> None:
-    """Check places as `check_places`, say which files are replaced, and make the folders of all.
+    """Check outputs as `check_places`, report the files that are replaced, and make all folders.
 
     Args:
         reads: As for `check_places`.
-        writes: Files that are to be written, by what asks for them.
-        overwrite: Whether files that this program did not write may be replaced.
+        writes: Files that are written, by option.
+        overwrite: True to replace files that this program did not write.
 
     Raises:
-        UsageError: Two are one.
+        UsageError: Two paths are the same file.
         SinkError: A file may not be replaced, or a folder cannot be made.
     """
     check_places(reads, writes)
@@ -119,7 +119,7 @@ def claim_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]
 
 
 def reads_of(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:
-    """Return files and folders that a command reads, by what they are, as ``check_places`` takes them."""
+    """Return the files and folders that a command reads, by role, for ``check_places``."""
     named = {f"--{name}": getattr(options, name, None) for name in ("source", "calibration", "light")}
     reads = {name: [Path(value)] for name, value in named.items() if value is not None and "://" not in str(value)}
     reads["the scene"] = [] if scene.path is None else [scene.path]
@@ -129,10 +129,10 @@ def reads_of(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]
 
 @contextlib.contextmanager
 def folder_to_oneself(folder: Path) -> Iterator[None]:
-    """Keep other runs from writing frames into a folder; the lock's file is removed at the end.
+    """Lock a folder against other runs while frames are written; the lock file is removed at the end.
 
     Raises:
-        UsageError: Another run has it.
+        UsageError: Another run has locked the folder.
     """
     lock = filelock.FileLock(folder / ".warp_ar.lock", timeout=0, mode=0o666)
     try:
@@ -140,7 +140,7 @@ def folder_to_oneself(folder: Path) -> Iterator[None]:
     except filelock.Timeout as error:
         raise UsageError(f"{folder} is in use: another run writes frames into it; give another --output") from error
     except (OSError, NotImplementedError):
-        yield  # a disk that cannot lock still takes frames
+        yield  # a file system without locks is accepted
         return
     try:
         yield
@@ -151,7 +151,7 @@ def folder_to_oneself(folder: Path) -> Iterator[None]:
 
 
 class OwnFiles:
-    """A folder, and the files that a command may write there."""
+    """Folder with the files that a command may write in it."""
 
     def __init__(
         self,
@@ -162,18 +162,18 @@ class OwnFiles:
         role: str = "--out",
         reads: Mapping[str, Sequence[Path]] | None = None,
     ) -> None:
-        """Refuse before anything is computed; say on stderr what will be replaced.
+        """Check the outputs before anything is computed, and report on stderr which files will be replaced.
 
         Args:
-            folder: Made if it is not there.
-            names: Of all files that may be written.
-            overwrite: Whether files that this program did not write may be replaced.
-            role: Of the folder, in messages.
-            reads: What the command reads, by what it is ("--extra").
+            folder: The folder; it is made if missing.
+            names: Names of all files that may be written.
+            overwrite: True to replace files that this program did not write.
+            role: Name of the folder in messages.
+            reads: Files that the command reads, by option ("--extra").
 
         Raises:
             SinkError: A file may not be replaced, or the folder cannot be made.
-            UsageError: A file is one that is read.
+            UsageError: An output file is also an input.
         """
         self._folder, self._names, self._role = folder, tuple(names), role
         replaced = []
@@ -188,11 +188,11 @@ class OwnFiles:
             say(words)
 
     def write(self, name: str, data: str | bytes) -> Path:
-        """Write a file, text as UTF-8; returns its path.
+        """Write a file, text as UTF-8, and return its path.
 
         Raises:
-            SinkError: It cannot be written; what stood there stays.
-            ValueError: It is none of ``names``.
+            SinkError: The file cannot be written; a former file is kept.
+            ValueError: The name is not among ``names``.
         """
         if name not in self._names:
             raise ValueError(f"{name} is not among the files that were looked at: {', '.join(self._names)}")

@@ -18,12 +18,12 @@ from warp_ar.engine.pipeline import TRACK, Result
 from warp_ar.errors import printable
 from warp_ar.stages import STAGES
 
-# Frames left out of medians: caches fill and modules load.
+# Frames left out of medians, because caches fill and modules load.
 WARM_UP = 3
 
 
 class RunLog:
-    """Collects poses and timings, frame by frame."""
+    """Log of poses and timings, frame by frame."""
 
     def __init__(self, pipeline: Any) -> None:
         """``pipeline`` is a ``Pipeline``, or an ``AutoPipeline``, which has a ``status`` of what it chose."""
@@ -38,22 +38,22 @@ class RunLog:
 
     @property
     def count(self) -> int:
-        """Frames so far."""
+        """Return the number of frames so far."""
         return len(self._frames)
 
     @property
     def fps(self) -> float:
-        """Frames per second since the first frame was done; 0 before the second."""
+        """Return frames per second since the first frame was done; 0 before the second."""
         passed = self._times[-1] - self._times[0] if self._times else 0.0
         return (self.count - 1) / passed if passed > 0.0 else 0.0
 
     def add(self, result: Result, *, decode_ms: float | None = None, encode_ms: float | None = None) -> None:
-        """Note one frame's result.
+        """Add one frame's result.
 
         Args:
-            result: What it became.
-            decode_ms: What its source took.
-            encode_ms: What its sink took.
+            result: Result of the frame.
+            decode_ms: Time of the source, milliseconds.
+            encode_ms: Time of the sink, milliseconds.
         """
         around = {"decode": decode_ms, **result.steps, "encode": encode_ms}
         self._steps.append({name: value for name, value in around.items() if value is not None})
@@ -73,23 +73,23 @@ class RunLog:
         self._frames.append({**frame, "left_out_of_this_frame": left_out} if left_out else frame)
 
     def median_ms(self, stage: str) -> float | None:
-        """Return the median milliseconds of ``stage`` over the frames in which it ran, warm-up excluded if possible."""
+        """Return the median milliseconds of ``stage`` over the frames in which it ran, without warm-up if possible."""
         return _medians([frame["stages"] for frame in self._frames]).get(stage)
 
     def skipped(self, stage: str) -> int:
-        """Return the frames in which ``stage`` was skipped because nothing that it reads had changed."""
+        """Return the number of frames in which ``stage`` was skipped because its inputs had not changed."""
         return self._skipped[stage]
 
     def left_out(self, stage: str) -> Mapping[str, int]:
-        """Return the frames of which ``stage`` was left out because it could change no pixel of them, by reason."""
+        """Return the number of frames without ``stage`` because it could change no pixel, by reason."""
         return self._left_out.get(stage, {})
 
     def steps(self) -> dict[str, float]:
-        """Return median milliseconds of each step of a frame's way; different frames take steps side by side."""
+        """Return median milliseconds of each step of a frame; steps of different frames run in parallel."""
         return _medians(self._steps)
 
     def report(self) -> dict[str, Any]:
-        """Return the run as plain data, ready for JSON."""
+        """Return the run's record as plain data for JSON."""
         plan, steps = self._pipeline.plan, self.steps()
         chooses = getattr(self._pipeline, "status", None)
         recovered = self._pipeline.arrays.get("recover_status")
@@ -109,25 +109,25 @@ class RunLog:
 
 
 def _medians(frames: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Return medians by name, without the first frames where there are enough."""
+    """Return medians by name, without warm-up frames if there are enough frames."""
     frames = frames[WARM_UP:] if len(frames) > 2 * WARM_UP else frames
     names = dict.fromkeys(name for frame in frames for name in frame)
     return {name: statistics.median(frame[name] for frame in frames if name in frame) for name in names}
 
 
 def stage_names(plan: Plan) -> list[str]:
-    """Return the names of what runs, the host's tracking included, in order."""
+    """Return the names of all running stages, including the host's tracking, in order."""
     return [TRACK] * plan.needs("pose") + [stage.name for stage, _ in plan.stages]
 
 
 def left_out(plan: Plan) -> list[tuple[str, str]]:
-    """Return (stage, reason) of all that does not run, the host's tracking included."""
+    """Return (stage, reason) of all stages that do not run, including the host's tracking."""
     tracking = [] if plan.needs("pose") else [(TRACK, "nothing reads the camera's pose")]
     return [*tracking, *plan.left_out]
 
 
 def _state(stage: str, log: RunLog | None) -> str:
-    """Return words for whether a stage of the plan ran in all frames."""
+    """Return a description of how often a stage of the plan ran."""
     if log is None:
         return "runs"
     skipped, left_out = log.skipped(stage), sum(log.left_out(stage).values())
@@ -138,7 +138,7 @@ def _state(stage: str, log: RunLog | None) -> str:
 
 
 def print_plan(plan: Plan, log: RunLog | None = None) -> None:
-    """Print the table of stages: what runs, with ``log`` its median times too, and what is left out and why."""
+    """Print the table of stages: running ones, with ``log`` their median times, and stages left out with the reason."""
     request = plan.request
     name = escape(printable(request.scene.name))
     table = Table(title=f"{name}, quality {request.quality.name}, {request.size[0]}x{request.size[1]}")

@@ -1,12 +1,12 @@
-"""A shot as other programs take it: the camera's way and lens, surfaces with their materials and motion, lights.
+"""Shot for exchange with other programs: camera track and lens, surfaces with materials and motion, lights.
 
-Lengths are metres, angles radians but where a name says degrees, the world is the marker's, z up. Radiance is in camera
-values: 1 is where the camera clips.
+Lengths are metres, angles radians unless a name contains degrees, and the world is the marker's, z up. Radiance is in
+camera values: 1 is where the camera clips.
 
-Exchange formats know fewer materials than scenes do: metallic-roughness, or an explicit specular colour, with pictures
-(UsdPreviewSurface and glTF). A mesh with materials of its own keeps all of them, each for its triangles. A Phong lobe
-of exponent n becomes GGX of alpha = sqrt(2 / (n + 2)), which is as wide, and its colour the reflectance straight on; a
-mirror becomes a metal without roughness.
+Exchange formats (UsdPreviewSurface and glTF) support fewer materials than scenes: metallic-roughness, or an explicit
+specular colour, with pictures. A mesh with materials of its own keeps all of them. A Phong lobe of exponent n becomes
+GGX of alpha = sqrt(2 / (n + 2)), which has the same width, with the lobe's colour as reflectance at normal incidence. A
+mirror becomes a metal with roughness 0.
 """
 
 from __future__ import annotations
@@ -54,45 +54,45 @@ FILM_WIDTH = 0.036
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture, and how it lies on the surface."""
+    """Picture with its placement on the surface."""
 
     codes: Codes
-    """RGB, or RGBA where alpha counts, (h, w, 3 or 4), row 0 at the top."""
+    """RGB, or RGBA if alpha is used, (h, w, 3 or 4), row 0 at the top."""
     use: TextureUse = dataclasses.field(default_factory=lambda: TextureUse(0))
-    """Its texture coordinates, its place on the surface and its borders."""
+    """Set of texture coordinates, transform and wrapping."""
 
     @property
     def placing(self) -> tuple[float, float, float, float, float]:
-        """Scale along u and v, counter-clockwise turn in radians, then offsets, for v that points up."""
+        """Return scale along u and v, counter-clockwise rotation in radians, and offsets, for v pointing up."""
         a, b, c, d, e, f = self.use.transform
         turn = math.atan2(d, a)
         return math.hypot(a, d), e * math.cos(turn) - b * math.sin(turn), turn, c, f
 
     def encode(self) -> bytes:
-        """Return the PNG."""
+        """Return the picture as PNG."""
         return encode_png(self.codes)
 
     @property
     def digest(self) -> bytes:
-        """Equal for equal codes."""
+        """Return a hash of the codes."""
         return hashlib.blake2b(self.codes.tobytes(), person=b"%d" % self.codes.shape[1]).digest()
 
 
 @dataclasses.dataclass(frozen=True)
 class ExchangeMaterial:
-    """A material as UsdPreviewSurface and glTF know it."""
+    """Material in the form of UsdPreviewSurface and glTF."""
 
     base_color: RGB = (0.8, 0.8, 0.8)
-    """Linear; multiplies the texture."""
+    """Base colour, linear RGB; multiplies the texture."""
     metallic: float = 0.0
     roughness: float = 1.0
-    """Perceptual: alpha is its square."""
+    """Perceptual roughness: alpha is its square."""
     specular: RGB | None = None
-    """Reflectance straight on where it is given; None: by ``metallic``, 0.04 for what is no metal."""
+    """Reflectance at normal incidence; None: by ``metallic``, with 0.04 for non-metals."""
     pictures: Mapping[str, Picture] = dataclasses.field(default_factory=dict)
     """Pictures by use: "" (base colour and opacity), emission, metallic_roughness, normal, occlusion."""
     own: MeshMaterial = dataclasses.field(default_factory=MeshMaterial)
-    """The scene's material, for all that formats tell alike: alpha, emission, factors of pictures."""
+    """The scene's material, for properties that all formats share: alpha, emission, factors of pictures."""
 
 
 def exchange_materials_of(item: Object, mesh: Mesh) -> tuple[ExchangeMaterial, ...]:
@@ -132,7 +132,7 @@ def _exchange_material(item: Object, mesh: Mesh, own: MeshMaterial) -> ExchangeM
 
 
 def _colored(color: Color, base: Picture | None, mesh: Mesh) -> tuple[RGB, Picture | None]:
-    """Return factor and texture of a colour; a texture that the mesh brings is multiplied by the material's."""
+    """Return factor and texture of a colour; a texture of the mesh is multiplied by that of the material."""
     if not isinstance(color, Path):
         return color, base
     own = load_texture(color)
@@ -160,7 +160,7 @@ def to_linear(codes: Codes) -> Array:
 
 
 def texture_plan(path: Path, name: str, materials: Sequence[ExchangeMaterial]) -> dict[tuple[int, str], Path]:
-    """Return where the pictures of a body go that cannot lie in the file itself, by material and what they are of.
+    """Return the paths of a body's pictures that are stored beside the file, by material and use.
 
     Equal pictures share a file.
     """
@@ -175,7 +175,7 @@ def texture_plan(path: Path, name: str, materials: Sequence[ExchangeMaterial]) -
 
 
 def used_materials(item: Object, mesh: Mesh) -> tuple[tuple[ExchangeMaterial, ...], npt.NDArray[np.int64] | None]:
-    """Return the materials that triangles have, and which of them each has, (m,); None: all the first."""
+    """Return the materials used by triangles, and the material index of each triangle, (m,); None: all the first."""
     materials = exchange_materials_of(item, mesh)
     if len(materials) == 1 or mesh.triangle_materials is None:
         return materials[:1], None
@@ -185,23 +185,23 @@ def used_materials(item: Object, mesh: Mesh) -> tuple[tuple[ExchangeMaterial, ..
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A surface of the shot."""
+    """Surface of the shot."""
 
     name: str
     mesh: Mesh
     materials: tuple[ExchangeMaterial, ...]
-    """Materials that its triangles have, one or more."""
+    """Materials of its triangles, at least one."""
     proxy: bool
-    """Physical: it is in the plate and only receives light and shadow."""
+    """True for physical geometry, which is in the plate and only receives light and shadow."""
     placements: tuple[Matrix, ...]
-    """``world_from_mesh``, (4, 4), of every frame; one where it stands still."""
+    """``world_from_mesh``, (4, 4), of every frame; a single one if it does not move."""
     numbers: npt.NDArray[np.int64] | None = None
     """Index into ``materials`` of each triangle, (m,); None: all the first."""
     colors: npt.NDArray[np.float32] | None = None
     """Factors of base colour and alpha at vertices, (n, 4), linear."""
 
     def triangles_of(self, number: int) -> npt.NDArray[np.int64]:
-        """Return the triangles that have a material."""
+        """Return the indices of triangles with a material."""
         if self.numbers is None:
             return np.arange(len(self.mesh.faces))
         return np.flatnonzero(self.numbers == number)
@@ -209,22 +209,22 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class Shot:
-    """Content of an exchange file."""
+    """Contents of an exchange file."""
 
     scene: Scene
-    """Its camera is that of the frames."""
+    """Scene with the camera of the frames."""
     fps: float
     """Frames per second."""
     poses: tuple[Pose | None, ...]
-    """``camera_from_world`` of every frame; None where the marker was lost."""
+    """``camera_from_world`` of every frame; None if the marker was lost."""
     plate: Path | None = None
-    """The frames, relative to the file's folder: a video, or a folder of pictures."""
+    """Video, or folder of pictures, with the frames; relative to the file's folder."""
     environment: Path | None = None
     """Latlong OpenEXR in the axes ``y-up``."""
     radiance: npt.NDArray[np.float32] | None = None
-    """The same, (height, 2 height, 3), z-up, for files that hold it themselves."""
+    """Radiance of the environment, (height, 2 height, 3), z-up, for formats that embed it."""
     others: tuple[tuple[Path, tuple[float, float, float]], ...] = ()
-    """Environment, as ``environment``, and place, metres, of each interpolated mirror ball after the first."""
+    """Environment file and position in metres of each interpolated mirror ball after the first."""
 
     @property
     def camera(self) -> Camera:
@@ -237,7 +237,7 @@ class Shot:
         return tuple(index / self.fps for index in range(len(self.poses)))
 
     def camera_placements(self) -> dict[int, Matrix]:
-        """``world_from_camera`` by frame, (4, 4), of a camera that looks along its -z, its y up, as in USD and glTF."""
+        """Return ``world_from_camera``, (4, 4), by frame, for a camera that faces -z with y up, as in USD and glTF."""
         found = {}
         for index, pose in enumerate(self.poses):
             if pose is not None:
@@ -246,7 +246,7 @@ class Shot:
         return found
 
     def bodies(self) -> list[Body]:
-        """Virtual objects, then proxies, by the names of ``surface_names``."""
+        """Return virtual objects, then proxies, named as in ``surface_names``."""
         names, scene = surface_names(self.scene), self.scene
         items: Sequence[ObjectShape | Proxy] = (*object_shapes(scene), *scene.proxies)
         return [self._body(name, item) for name, item in zip(names, items, strict=False)]
@@ -262,7 +262,7 @@ class Shot:
         return Body(name, mesh, materials, False, self._placements(shape), numbers, colors)
 
     def _placements(self, shape: ObjectShape) -> tuple[Matrix, ...]:
-        """``world_from_mesh`` of every frame; one where it stands still."""
+        """Return ``world_from_mesh`` of every frame; a single one if the shape does not move."""
         item = shape.item
         if shape.moving is not None and shape.mesh is not None:
             return tuple(part_placements(item, shape.moving, seconds)[shape.part] for seconds in self.seconds)
@@ -270,20 +270,23 @@ class Shot:
         return tuple(placement(item.scale * r, t) for r, t in map(item.pose_at, times))
 
     def light_placements(self, light: Light) -> tuple[Matrix, ...]:
-        """``world_from_light``, (4, 4), of every frame, of a light that shines along its -z; one if it stands still."""
+        """Return ``world_from_light``, (4, 4), of every frame, for a light that shines along -z.
+
+        A single one if it is static.
+        """
         times = self.seconds if light.animate is not None else (0.0,)
         return tuple(placement(_turn_to(direction), at) for at, direction in map(light.pose_at, times))
 
 
 def placement(linear: Any, translation: Any) -> Matrix:
-    """A (4, 4) matrix that maps columns: x to linear x + translation."""
+    """Return the (4, 4) matrix, for column vectors, that maps x to linear x + translation."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, translation
     return matrix
 
 
 def _turn_to(direction: Matrix) -> Matrix:
-    """A rotation that turns -z to a unit direction."""
+    """Return a rotation of -z to a unit direction."""
     back = -direction
     side = np.cross([0.0, 1.0, 0.0] if abs(back[1]) < 0.9 else [1.0, 0.0, 0.0], back)
     side /= np.linalg.norm(side)
@@ -291,7 +294,7 @@ def _turn_to(direction: Matrix) -> Matrix:
 
 
 def mesh_of(item: Object | Proxy) -> Mesh:
-    """Triangles of an object or a proxy, before scale and pose."""
+    """Return the triangles of an object or a proxy, before scale and pose."""
     if isinstance(item, Object) and item.mesh is not None:
         return item.mesh
     if item.file is not None:
@@ -314,7 +317,7 @@ def mesh_of(item: Object | Proxy) -> Mesh:
 
 
 def texture_files(scene: Scene, path: Path) -> dict[str, Path]:
-    """Pictures that go beside a file, by the names of their bodies and what they are of."""
+    """Return the pictures stored beside a file, by body name and use."""
     found = {}
     for name, shape in zip(surface_names(scene), object_shapes(scene), strict=False):
         materials, _ = used_materials(shape.item, shape.mesh or mesh_of(shape.item))
@@ -324,5 +327,5 @@ def texture_files(scene: Scene, path: Path) -> dict[str, Path]:
 
 
 def key_frames(placements: Sequence[Matrix]) -> Sequence[Matrix]:
-    """Placements without repetition: one if all are equal."""
+    """Return placements reduced to one if all are equal."""
     return placements[:1] if all(np.array_equal(one, placements[0]) for one in placements) else placements

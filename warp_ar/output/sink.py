@@ -1,7 +1,7 @@
-"""The base of all sinks of frames, and how those that encode do so on threads of their own.
+"""Base classes of all sinks of frames, and encoding on threads.
 
-A sink encodes while the next frame is being made, a few frames deep at most. What fails there is raised by the next
-`write`, or by `close`. Whether a place can be written at all is found out when it is opened.
+A sink encodes while the next frame is computed, with at most a few frames waiting. Errors are raised by the next
+`write` or by `close`. Opening a sink checks that its place can be written.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from warp_ar.errors import SinkError, reason
 from warp_ar.files import kind_of
 
 FRAMES_WAITING = 4
-"""Frames that may wait to be encoded before `Sink.write` waits."""
+"""Number of frames that may wait for encoding before `Sink.write` blocks."""
 
 _open: weakref.WeakSet[ThreadedSink] = weakref.WeakSet()
-"""Sinks whose last frame is not stored yet."""
+"""Sinks whose last frame is not yet stored."""
 
 
 def close_open_sinks() -> None:
-    """Close every sink that an interrupted `Sink.close`, or one that was never reached, left unfinished.
+    """Close every sink whose `Sink.close` was interrupted or never called.
 
-    A signal's exception may come up anywhere, on the way into `close` too, where no code of that can catch it. Who
-    turns signals into exceptions calls this once no more come.
+    A signal's exception may be raised anywhere, also on entry to `close` before its error handling. Code that turns
+    signals into exceptions calls this function after the last signal.
 
     Raises:
-        SinkError: The last of those that sinks raised.
+        SinkError: The last error of a sink.
     """
     with contextlib.ExitStack() as stack:
         for sink in list(_open):
@@ -49,42 +49,41 @@ class Sink(Closing):
     """Destination of frames: a context manager."""
 
     description: str
-    """One line for people, with a note where the frames are changed."""
+    """Description for users, one line, with a note if frames are changed."""
 
     written: int = 0
-    """Frames that are stored; of a sink that failed, those that are whole."""
+    """Number of stored frames; after a failure, of complete ones."""
 
     replaced: str = ""
-    """Files that its first frame replaces, in words; empty if there are none."""
+    """Description of the files that the first frame replaces; empty if there are none."""
 
     @abstractmethod
     def write(self, image: npt.NDArray[Any]) -> None:
-        """Take the next frame; the array may be reused at once.
+        """Write the next frame; the array may be reused immediately.
 
         Args:
             image: Encoded colour, uint8 RGB, (height, width, 3); linear radiance, float32, where the sink's coding has
                 more than 8 bits.
 
         Raises:
-            SinkError: The image is of another size or kind than can be written, or an earlier frame could not be
-                written.
+            SinkError: The image's size or type cannot be written, or an earlier frame could not be written.
         """
 
     def write_at(self, image: npt.NDArray[Any], seconds: float) -> None:
-        """Take the next frame, shown ``seconds`` after time 0, which only sinks that keep times heed; as `write`."""
+        """Write the next frame with a display time in seconds, which only sinks with time stamps use; as `write`."""
         self.write(image)
 
     @abstractmethod
     def close(self) -> None:
-        """Write what waits, finish the file and end every thread; a second call does nothing.
+        """Write waiting frames, finish the file and end all threads; a second call does nothing.
 
         Raises:
-            SinkError: A frame could not be written, and no `write` has said so yet.
+            SinkError: A frame could not be written, and no `write` has raised the error yet.
         """
 
 
 class ThreadedSink(Sink):
-    """Stores frames on threads, at most FRAMES_WAITING of them behind."""
+    """Sink that stores frames on threads, with at most FRAMES_WAITING frames waiting."""
 
     def __init__(self, threads: int) -> None:
         self._executor = _started_pool(threads)
@@ -98,15 +97,15 @@ class ThreadedSink(Sink):
         _open.add(self)
 
     def _check(self, image: Any) -> None:
-        """Raise SinkError if the frame is of a kind that cannot be written."""
+        """Raise SinkError if the frame's type cannot be written."""
         check_image(image)
 
     @abstractmethod
     def _store(self, index: int, image: Any) -> None:
-        """Encode and write one frame; runs on a thread, and raises SinkError."""
+        """Encode and write one frame; runs on a thread and raises SinkError."""
 
     def write(self, image: Any) -> None:
-        """Take the next frame, an array or whatever else has a shape and copies itself; it is stored on a thread.
+        """Write the next frame, an array or another object with ``shape`` and ``copy``; it is stored on a thread.
 
         Raises:
             SinkError: The sink is closed, the frame has another size or kind than those before it, or an earlier one
@@ -131,9 +130,9 @@ class ThreadedSink(Sink):
             self.written += 1
 
     def _settle(self, waiting: int) -> None:
-        """Wait until at most ``waiting`` frames are left, and raise what went wrong first."""
+        """Wait until at most ``waiting`` frames are left, and raise the first error."""
         while self._pending and (self._pending[0].done() or len(self._pending) > waiting):
-            # If this wait is interrupted, the frame is still in line.
+            # If this wait is interrupted, the frame stays in the queue.
             error = self._pending[0].exception()
             self._pending.popleft()
             if error is not None and self._error is None:
@@ -141,11 +140,11 @@ class ThreadedSink(Sink):
                 raise error
 
     def close(self) -> None:
-        """Store what waits and end the threads; where a signal interrupts that, a second call goes on with it."""
+        """Store waiting frames and end the threads; after an interruption by a signal, a second call continues."""
         if self._ended:
             return
         self._closed = True
-        # Finished on a thread, for a signal interrupts what the main thread does wherever it is.
+        # Finished on a thread, because a signal may interrupt the main thread anywhere.
         if self._last is None:
             self._last = self._executor.submit(self._finish_after, list(self._pending))
         try:
@@ -160,11 +159,11 @@ class ThreadedSink(Sink):
         concurrent.futures.wait(pending)
         with self._finishing:
             finished, self._finished = self._finished, True
-        if not finished:  # an interrupted call may have asked for it before
+        if not finished:  # an interrupted call may have submitted it before
             self._finish()
 
     def _wait_out(self) -> None:
-        """Wait for the threads' end, which one interrupt does not cut short."""
+        """Wait for the threads' end, also after one interrupt."""
         try:
             self._executor.shutdown(wait=True)
         except KeyboardInterrupt:
@@ -172,14 +171,14 @@ class ThreadedSink(Sink):
             raise
 
     def _finish(self) -> None:
-        """Close what is open, after the last frame has been stored; runs on a thread."""
+        """Close open files after the last frame has been stored; runs on a thread."""
 
 
 def _started_pool(threads: int) -> ThreadPoolExecutor:
-    """An executor whose threads all run.
+    """Return an executor whose threads have all been started.
 
-    It starts them as they are needed, and where a signal interrupts that it forgets the thread, which works all the
-    same: nobody waits for it, and another one that takes its place works beside it. Here no frame is there to be lost.
+    An executor starts threads on demand. If a signal interrupts that, it forgets the running thread and starts another
+    one beside it. Here no frame is waiting yet, so none can be lost.
     """
     pool, everyone = ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-sink"), threading.Event()
     try:
@@ -191,7 +190,7 @@ def _started_pool(threads: int) -> ThreadPoolExecutor:
 
 
 class NullSink(Sink):
-    """Takes frames and forgets them; ``count`` is their number."""
+    """Sink that discards frames; ``count`` is their number."""
 
     description = "nowhere"
 
@@ -208,10 +207,10 @@ class NullSink(Sink):
 
 
 def check_image(image: npt.NDArray[Any], kind: type = np.uint8) -> None:
-    """Check that an array is a frame: of codes (uint8), or of linear radiance (float32).
+    """Check that an array is a frame of codes (uint8) or of linear radiance (float32).
 
     Raises:
-        SinkError: It is none.
+        SinkError: The array is no such frame.
     """
     if image.dtype != kind or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         what = "a frame is uint8" if kind is np.uint8 else "a frame of radiance is float32"
@@ -219,10 +218,10 @@ def check_image(image: npt.NDArray[Any], kind: type = np.uint8) -> None:
 
 
 def make_folder(path: pathlib.Path) -> None:
-    """Make the folder and its parents, and find out whether files can be made in it.
+    """Make the folder and its parents, and check that files can be created in it.
 
     Raises:
-        SinkError: The path is no folder, or none that can be written to.
+        SinkError: The path is no folder, or is not writable.
     """
     try:
         if (kind := kind_of(path)) not in ("folder", "nothing"):

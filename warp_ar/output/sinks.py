@@ -1,7 +1,7 @@
-"""Frames out: folders of numbered pictures, of environments, and video.
+"""Sinks of frames: folders of numbered pictures or environments, and video.
 
-A folder holds PNGs of 8 or 16 bits, OpenEXRs of linear radiance (channels R, G, B of 16-bit floats, Rec. 709's
-primaries), or environments. Other files in it are left alone; a frame appears under its name only when it is whole.
+A folder contains PNGs with 8 or 16 bits, OpenEXRs with linear radiance (channels R, G, B as 16-bit floats, Rec. 709
+primaries), or environments. Other files in it are not changed. A frame gets its name only when it is complete.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from warp_ar.signals import REC_709
 from warp_ar.signature import encode_png, is_signed
 
 FOLDER_CODINGS: Final = {"8bit": "numbered frames", "16bit": "numbered frames of 16 bits", "exr": "numbered OpenEXRs"}
-"""Contents of a folder's pictures, and their words."""
+"""Codings of a folder's pictures, with their descriptions."""
 FOLDER_THREADS = 2
-"""Threads that compress the frames of a folder."""
+"""Number of threads that compress the frames of a folder."""
 
-# Camera frames hardly repeat, so looking for repetitions costs time and saves no byte; neighbours are alike.
+# Camera frames hardly repeat: searching repetitions costs time and saves no bytes, but neighbouring pixels are similar.
 PNG_OPTIONS = (
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
@@ -45,16 +45,16 @@ PNG_OPTIONS = (
 class FolderSink(ThreadedSink):
     """A folder of numbered frames, ``0000.png`` or ``0000.exr`` the first.
 
-    Numbered frames that stood there go with the first new one, so that what the folder holds is of one run.
+    The first new frame removes numbered frames of earlier runs, so that the folder contains one run only.
 
     Args:
         path: The folder.
-        overwrite: Whether numbered frames that this program did not write may go.
+        overwrite: True to remove numbered frames that this program did not write.
         coding: One of ``FOLDER_CODINGS``; all but ``8bit`` take linear radiance.
-        transfer: The camera's, by which codes of 16 bits are encoded.
+        transfer: Transfer function of the camera, for 16-bit codes.
 
     Raises:
-        SinkError: The folder cannot be made or written to, or holds frames that may not go.
+        SinkError: The folder cannot be made or written to, or holds frames that must not be removed.
     """
 
     _suffix = ".png"
@@ -72,7 +72,7 @@ class FolderSink(ThreadedSink):
         super().__init__(FOLDER_THREADS)
 
     def _find_earlier(self, folder: pathlib.Path, suffix: str, *, overwrite: bool) -> None:
-        """Note the numbered frames that the first new one replaces; raises SinkError where they may not go."""
+        """Find the numbered frames that the first new one replaces; raise SinkError if they must not be removed."""
         self._earlier += earlier_frames(folder, suffix, overwrite=overwrite)
         if self._earlier:
             self.replaced = f"{self._path}: {len(self._earlier)} numbered frames of an earlier run are replaced"
@@ -81,14 +81,15 @@ class FolderSink(ThreadedSink):
         check_image(image, np.uint8 if self._coding == "8bit" else np.float32)
 
     def write(self, image: Any) -> None:
-        """Take the next frame; the first one clears away those of an earlier run.
+        """Write the next frame; the first one removes frames of an earlier run.
 
         Raises:
-            SinkError: It is no frame, another frame could not be written, or an earlier run's cannot be replaced.
+            SinkError: The image is no frame, another frame could not be written, or an earlier run's frame cannot be
+                removed.
         """
         self._check(image)
         earlier, self._earlier = self._earlier, []
-        # The last first: who is killed meanwhile leaves the beginning of the earlier run, all parts of its frames.
+        # Last frames first: an interrupted run leaves the beginning of the earlier run with all its files.
         for path in reversed(earlier):
             try:
                 path.unlink(missing_ok=True)
@@ -104,7 +105,7 @@ class FolderSink(ThreadedSink):
             store_exr(path, OpenEXR.File(exr_header(chromaticities=REC_709), channels))
             return
         if self._coding == "16bit":
-            from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
+            from warp_ar.kernels.color import encode_codes  # loads Warp: only after the page is open
 
             image = np.rint(65535.0 * encode_codes(self._transfer, image)).astype(np.uint16)
         store(path, encode_png(image, PNG_OPTIONS))
@@ -113,8 +114,8 @@ class FolderSink(ThreadedSink):
 class EnvironmentSink(FolderSink):
     """A folder of ``NNNN.exr``, numbered from 0, each as `write_environment` writes it.
 
-    The first one also clears away what this program left in folders ``ball_1``, ``ball_2``, ... below: light of an
-    earlier run, of mirror balls that this one may not have.
+    The first map also removes this program's files in the subfolders ``ball_1``, ``ball_2``, ...: light of an earlier
+    run at mirror balls that the scene may no longer have.
     """
 
     _suffix = ".exr"
@@ -134,11 +135,11 @@ class EnvironmentSink(FolderSink):
         check_environment(image)
 
     def write(self, image: npt.NDArray[Any]) -> None:
-        """Take the next map; the first one clears away those of an earlier run, and folders that are empty then."""
+        """Write the next map; the first one removes an earlier run's maps, and folders that become empty."""
         emptied = {path.parent for path in self._earlier} - {self._path}
         super().write(image)
         for folder in emptied:
-            with contextlib.suppress(OSError):  # it holds something else: that stays, and so does the folder
+            with contextlib.suppress(OSError):  # it contains other files, so the folder stays
                 folder.rmdir()
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
@@ -160,18 +161,18 @@ def open_sink(
 ) -> Sink:
     """Open a sink: a video for .mp4, .mkv and .mov, a folder of pictures for a name without an ending.
 
-    Folders that are missing on the way are made.
+    Missing parent folders are made.
 
     Args:
         path: File or folder; a folder that exists may have any name, as may one whose name ends in a slash.
         fps: Frames per second of a video.
-        size: (width, height) of the frames in pixels, if known; the first frame tells otherwise.
-        overwrite: Whether files that this program did not write may be replaced.
+        size: (width, height) of the frames in pixels, if known; else that of the first frame.
+        overwrite: True to replace files that this program did not write.
         coding: What is written: ``8bit``; of linear radiance ``10bit``, ``pq`` or ``hlg`` in a video, ``16bit`` (PNG)
             or ``exr`` in a folder.
-        transfer: The camera's, by which 10- and 16-bit codes are encoded.
-        encoder: FFmpeg's name of a video's; None: H.264 for 8 bits, H.265 for more.
-        encoder_options: Its own, by FFmpeg's names.
+        transfer: Transfer function of the camera, for 10- and 16-bit codes.
+        encoder: FFmpeg's name of a video's encoder; None: H.264 for 8 bits, H.265 for more.
+        encoder_options: Options of the encoder, by FFmpeg's names.
         tick: Seconds of the unit in which a video keeps the times of `Sink.write_at`; None: one frame's at ``fps``.
 
     Raises:

@@ -1,9 +1,10 @@
-"""A shot as USD (``.usda``, ``.usdc``, ``.usd``): needs ``usd-core``, of the extra ``exchange``.
+"""Export of a shot as USD (``.usda``, ``.usdc``, ``.usd``); needs ``usd-core``, from the extra ``exchange``.
 
-z is up and a unit is a metre. The camera's apertures carry its principal point and both focal lengths, so its frustum
-is the pinhole of the frames; USD has no distortion (see ``stmap``). Proxies stand below ``/shot/proxies``, virtual
-objects below ``/shot/objects``. A light's ``normalize`` makes its power independent of its size: a white surface that
-faces a sphere light of intensity i at distance d has radiance i / (4 pi d^2), so i = 4 I for a radiant intensity I.
+z is up and the unit is a metre. The camera's apertures encode its principal point and both focal lengths, so its
+frustum is that of the undistorted frames; USD has no lens distortion (see ``stmap``). Proxies are below
+``/shot/proxies``, virtual objects below ``/shot/objects``. A light's ``normalize`` makes its power independent of its
+size: a white surface that faces a sphere light of intensity i at distance d has radiance i / (4 pi d^2), so i = 4 I for
+a radiant intensity I.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from warp_ar.signature import PROGRAM
 USD_SUFFIXES = (".usda", ".usdc", ".usd")
 
 SUN_DEGREES = 0.53
-"""Angle of a directional light: the sun's."""
+"""Angular diameter of a directional light in degrees: the sun's."""
 _COORDINATES = ("st", "st1")
-"""Names of both sets of texture coordinates."""
+"""Names of the two sets of texture coordinates."""
 _TENTHS = 10.0
-"""Factor of a USD camera's lens lengths: they are in tenths of the stage's unit."""
+"""Factor on a USD camera's lens lengths, whose unit is a tenth of the stage's unit."""
 
 
 def load_usd() -> Any:
-    """Return the modules of USD.
+    """Return USD's modules.
 
     Raises:
         UsageError: It is not installed.
@@ -53,11 +54,11 @@ def load_usd() -> Any:
 
 
 def write_usd(path: Path, shot: Shot) -> list[Path]:
-    """Write a shot as USD; textures go beside it.
+    """Write a shot as USD, with textures beside it.
 
     Args:
-        path: Ends in one of ``USD_SUFFIXES``.
-        shot: What to tell.
+        path: Path with one of the suffixes ``USD_SUFFIXES``.
+        shot: The shot.
 
     Returns:
         The files that were written.
@@ -87,7 +88,7 @@ def write_usd(path: Path, shot: Shot) -> list[Path]:
     if shot.environment is not None:
         _write_dome(pxr, stage, "/shot/lights/environment", shot.environment)
     for ball, (file, at) in enumerate(shot.others, 1):
-        # The light of another place: a program that interpolates or chooses finds it, none adds it to the first.
+        # Light at another position: programs that interpolate or choose can use it, and none adds it to the first.
         prim = _write_dome(pxr, stage, f"/shot/lights/environment_{ball}", file)
         prim.SetCustomDataByKey("at", pxr.Gf.Vec3d(*at))
         prim.SetActive(False)
@@ -96,12 +97,12 @@ def write_usd(path: Path, shot: Shot) -> list[Path]:
 
 
 def _write_dome(pxr: Any, stage: Any, path: str, file: Path) -> Any:
-    """Write the light of an environment; returns its prim."""
+    """Write the dome light of an environment, and return its prim."""
     dome = pxr.UsdLux.DomeLight.Define(stage, path)
     dome.CreateIntensityAttr(1.0)
     dome.CreateTextureFileAttr(f"./{file.name}")
     dome.CreateTextureFormatAttr(pxr.UsdLux.Tokens.latlong)
-    # A dome's pole is its own y.
+    # A dome's pole is its own y axis.
     dome.AddRotateXOp().Set(90.0)
     return dome.GetPrim()
 
@@ -112,7 +113,7 @@ def _export(stage: Any, part: Path) -> None:
 
 
 def _place(pxr: Any, prim: Any, placements: dict[int, Matrix]) -> None:
-    """Give a prim its transform, by frame; USD's matrices map rows."""
+    """Set a prim's transform by frame; USD's matrices are for row vectors."""
     operation = prim.AddTransformOp()
     if len(placements) == 1:
         operation.Set(pxr.Gf.Matrix4d(*next(iter(placements.values())).T.reshape(-1).tolist()))
@@ -129,7 +130,7 @@ def _write_camera(pxr: Any, stage: Any, shot: Shot) -> None:
     prim.CreateFocalLengthAttr(scale)
     prim.CreateHorizontalApertureAttr(scale * camera.width / camera.fx)
     prim.CreateVerticalApertureAttr(scale * camera.height / camera.fy)
-    # Where the middle of the picture looks; its pixels have their centres at integers, and y is up.
+    # Offset of the picture's centre; pixel centres are at integers, and y is up.
     prim.CreateHorizontalApertureOffsetAttr(scale * (0.5 * (camera.width - 1) - camera.cx) / camera.fx)
     prim.CreateVerticalApertureOffsetAttr(scale * (camera.cy - 0.5 * (camera.height - 1)) / camera.fy)
     prim.CreateClippingRangeAttr(pxr.Gf.Vec2f(0.01, 1000.0))
@@ -171,7 +172,7 @@ def _write_body(pxr: Any, stage: Any, body: Body, path: Path) -> list[Path]:
 
 
 def _base_colors(body: Body) -> npt.NDArray[np.float32]:
-    """Base colour at vertices, (n, 3): USD's surface multiplies no colours, so the materials' are in it."""
+    """Return base colours at vertices, (n, 3), including the materials': USD's surface cannot multiply colours."""
     assert body.colors is not None
     found = np.ascontiguousarray(body.colors[:, :3])
     for number, material in enumerate(body.materials):
@@ -181,7 +182,7 @@ def _base_colors(body: Body) -> npt.NDArray[np.float32]:
 
 
 def _write_materials(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> list[Path]:
-    """The materials, of several each for its triangles; their pictures go beside the file."""
+    """Write the materials, each for its triangles, and their pictures beside the file."""
     plan = texture_plan(path, body.name, body.materials)
     written: dict[Path, None] = {}
     for number, material in enumerate(body.materials):
@@ -203,7 +204,7 @@ def _write_materials(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) ->
 
 
 class _Material:
-    """A material as UsdPreviewSurface, with its pictures."""
+    """Writer of a material as UsdPreviewSurface, with its pictures."""
 
     def __init__(self, pxr: Any, stage: Any, where: str, material: ExchangeMaterial, files: dict[str, Path]) -> None:
         self._pxr, self._stage, self._where, self._material, self._files = pxr, stage, where, material, files
@@ -212,12 +213,15 @@ class _Material:
         self._surface = self._shader("surface", "UsdPreviewSurface")
 
     def write(self, *, colored: bool) -> Any:
-        """Return the material; with ``colored`` the mesh's ``displayColor`` is the base colour where no picture is."""
+        """Return the material.
+
+        With ``colored``, the mesh's ``displayColor`` is the base colour if there is no picture.
+        """
         material, own, files = self._material, self._material.own, self._files
         if material.specular is not None:
             self._set("useSpecularWorkflow", 1)
             self._set("specularColor", self._pxr.Gf.Vec3f(*material.specular))
-        # What is shown as it is neither reflects nor waits for light.
+        # An unlit material has neither reflection nor diffuse light.
         shown = "emissiveColor" if own.unlit else "diffuseColor"
         if own.unlit:
             self._set("diffuseColor", self._pxr.Gf.Vec3f(0.0))
@@ -279,7 +283,7 @@ class _Material:
         bias: Sequence[float] | None = None,
         space: str = "raw",
     ) -> None:
-        """Connect inputs to channels of a picture, read by its texture coordinates, times ``scale`` plus ``bias``."""
+        """Connect inputs to a picture's channels at its texture coordinates, times ``scale`` plus ``bias``."""
         picture, names, gf = self._material.pictures[kind], self._pxr.Sdf.ValueTypeNames, self._pxr.Gf
         name = kind or "texture"
         texture = self._shader(name, "UsdUVTexture")

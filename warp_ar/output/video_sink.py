@@ -1,7 +1,7 @@
-"""Frames as video: H.264 in 8 bits, H.265 in 10 bits and HDR, or any other encoder of FFmpeg.
+"""Frames as video: H.264 with 8 bits, H.265 with 10 bits and HDR, or another encoder of FFmpeg.
 
-A video is a whole file at any moment: it grows in fragments of half a second, so that a process that is killed leaves
-all but about its last second; `close` turns MP4 and MOV into the ordinary form that every player can seek in.
+A video is playable at any moment: it is written in fragments of half a second, so that a killed process loses only
+about the last second. `close` converts MP4 and MOV into the ordinary form, in which every player can seek.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from warp_ar.signature import PROGRAM
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 VIDEO_SUFFIXES = tuple(_FORMATS)
-"""Endings of a video's name."""
+"""Suffixes of video files."""
 
 FRAGMENT_SECONDS = 0.5
-"""Longest time between key frames, and so between the fragments that reach the disk."""
+"""Longest time between key frames, and thus between fragments."""
 
 
 _TAGS = {
@@ -43,38 +43,38 @@ _TAGS = {
     "pq": (Colorspace.BT2020, ColorPrimaries.BT2020, ColorTrc.SMPTE2084),
     "hlg": (Colorspace.BT2020, ColorPrimaries.BT2020, ColorTrc.ARIB_STD_B67),
 }
-"""Matrix, primaries and transfer that a stream is tagged with."""
+"""Matrix, primaries and transfer in a stream's metadata, by coding."""
 _MATROSKA_TICK = fractions.Fraction(1, 1000)
-"""Seconds of the unit in which Matroska counts: two times within one would become equal."""
+"""Time unit of Matroska in seconds; closer times would become equal."""
 _MPEG4_TICKS = 60000
-"""Ticks a second of MPEG-4 part 2, which counts them in 16 bits."""
+"""Largest number of ticks per second of MPEG-4 part 2, which counts them in 16 bits."""
 _FULL_CHROMA = "yuv444p10le"
 _WORDS = {"libx264": "H.264", "libx265": "H.265"}
 
 
 _MEDIA = {True: b"mdat", False: b"\x1f\x43\xb6\x75"}
-"""First bytes of pictures: a box of MP4, a cluster of Matroska."""
+"""First bytes of picture data: a box of MP4, a cluster of Matroska."""
 _SEEK_SIZE = 0x10000
-"""FFmpeg's way to ask for the size of a file."""
+"""FFmpeg's value of ``whence`` that asks for the file's size."""
 
 
 class VideoSink(ThreadedSink):
-    """Video in MP4, MOV or Matroska: 4:2:0, limited range, tagged as what it is.
+    """Video in MP4, MOV or Matroska: 4:2:0, limited range, with its colour space in the metadata.
 
-    8-bit codes become BT.709. Frames of linear radiance, which the codings of 10 bits take, become the camera's codes
-    in BT.709, or HDR in BT.2020: reference white is 1, PQ's 203 cd/m² and 75 % of HLG's signal.
+    8-bit codes are written as BT.709. The 10-bit codings take linear radiance, and write it as the camera's codes in
+    BT.709 or as HDR in BT.2020. Reference white is 1, which is 203 cd/m² in PQ and 75 % of HLG's signal.
 
-    Chroma at half resolution needs even sizes: an odd one is padded by repeating the last row or column, and the
-    description says so. A file that exists is replaced when the first frames are on the disk; if none come, or none
-    fits there, it is left as it was.
+    Chroma at half resolution needs even sizes: an odd size is padded by repeating the last row or column, and the
+    description notes it. An existing file is replaced when the first frames have been stored; until then it is
+    unchanged.
 
     Args:
         path: The file.
         fps: Frames per second.
         size: (width, height) of the frames in pixels, if known.
-        overwrite: Whether a file that this program did not write may be replaced.
-        encoding: How it is encoded; None: H.264 in 8 bits.
-        transfer: The camera's, by which 10-bit codes are encoded.
+        overwrite: True to replace a file that this program did not write.
+        encoding: Encoder and options; None: H.264 with 8 bits.
+        transfer: Transfer function of the camera, for 10-bit codes.
         tick: Seconds of the unit in which times of `write_at` are kept; None: frame n is shown at n / fps.
 
     Raises:
@@ -136,13 +136,13 @@ class VideoSink(ThreadedSink):
         check_image(image, np.uint8 if self._encoding.coding == "8bit" else np.float32)
 
     def write(self, image: npt.NDArray[Any]) -> None:
-        """Take the next frame; the first one settles the size."""
+        """Write the next frame; the first one determines the size."""
         super().write(image)
         if self._count == 1:
             self._describe()
 
     def write_at(self, image: npt.NDArray[Any], seconds: float) -> None:
-        """Take the next frame, shown at ``seconds`` where times are kept; the first one settles the size."""
+        """Write the next frame, displayed at ``seconds`` if time stamps are kept; the first one determines the size."""
         if self._timed:
             self._times[self._count] = seconds
         self.write(image)
@@ -172,7 +172,7 @@ class VideoSink(ThreadedSink):
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         if self._broken:
-            return  # FFmpeg may crash when it goes on after a failure.
+            return  # FFmpeg may crash if writing continues after a failure.
         image = of_even_size(image)
         try:
             if self._container is None:
@@ -202,7 +202,7 @@ class VideoSink(ThreadedSink):
                 self._file.close()
             self._file.check()
         except (av.FFmpegError, OSError) as error:
-            # After a frame that could not be written, the end cannot be either: once is enough.
+            # After a failed frame, the trailer fails as well; one error is enough.
             if self._error is None:
                 raise SinkError(f"{self._path} cannot be finished: {reason(error)}") from error
         finally:
@@ -211,7 +211,7 @@ class VideoSink(ThreadedSink):
 
 
 def _count_frames(path: pathlib.Path) -> int:
-    """Frames of a video that was not finished, of which the encoder held some back."""
+    """Return the number of frames in an unfinished video, because the encoder held some back."""
     try:
         with av.open(str(path)) as container:
             return sum(packet.size > 0 for packet in container.demux(video=0))
@@ -222,15 +222,15 @@ def _count_frames(path: pathlib.Path) -> int:
 def add_stream(
     container: Any, rate: fractions.Fraction, width: int, height: int, encoding: Encoding, options: Mapping[str, str]
 ) -> Any:
-    """A stream of video in a new container, tagged as what it is.
+    """Add a video stream to a new container, with its colour space in the metadata.
 
     Args:
-        container: PyAV's.
+        container: Output container of PyAV.
         rate: Frames per second.
-        width: Even.
-        height: Even.
-        encoding: How it is encoded.
-        options: Of the encoder; those of ``encoding`` go before them.
+        width: Width in pixels, even.
+        height: Height in pixels, even.
+        encoding: Encoder, coding and options.
+        options: Default options of the encoder, which ``encoding`` overrides.
     """
     stream = container.add_stream(encoding.encoder, rate=rate, options={**options, **encoding.options})
     stream.width, stream.height, stream.pix_fmt = width, height, encoding.pixel_format
@@ -241,12 +241,12 @@ def add_stream(
 
 
 def tag_for_players(stream: Any) -> None:
-    """Name H.265 in MP4 and MOV as Apple's players know it."""
+    """Set the tag of H.265 in MP4 and MOV that Apple's players expect."""
     stream.codec_context.codec_tag = "hvc1"
 
 
 def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """A picture whose last row or column stands twice where its size is odd: chroma has half the size."""
+    """Return a picture padded to even size by repeating its last row or column, for chroma subsampling."""
     height, width = image.shape[:2]
     if height % 2 or width % 2:
         image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
@@ -256,11 +256,11 @@ def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def rgb_to_yuv(
     width: int, height: int, time_base: fractions.Fraction, coding: str = "8bit", pixel_format: str = "yuv420p"
 ) -> Any:
-    """Filter from rgb24, or from Y'CbCr of 16 bits without subsampling, to what an encoder takes.
+    """Return the filter from rgb24, or from 16-bit Y'CbCr without subsampling, to an encoder's input format.
 
-    8-bit RGB becomes BT.709, limited range; that of more bits has its matrix already. Chroma is sited at the left one
-    of each pair of columns, as streams mean it unless they say otherwise: the plain converter puts it between the two,
-    which players show shifted by half a pixel.
+    8-bit RGB becomes BT.709 with limited range; pictures with more bits are Y'CbCr already. Chroma is sited at the left
+    column of each pair, the default of video streams. The plain converter sites it between both columns, which players
+    would show shifted by half a pixel.
     """
     graph = av.filter.Graph()
     graph.threads = 1
@@ -280,14 +280,14 @@ def rgb_to_yuv(
 
 
 def signal_of(radiance: npt.NDArray[np.float32], coding: str, transfer: str) -> npt.NDArray[np.float64]:
-    """R'G'B' from 0 to 1 of linear radiance, (height, width, 3), as a coding of 10 bits means it.
+    """Return R'G'B' from 0 to 1 of linear radiance, (height, width, 3), for a 10-bit coding.
 
     Args:
         radiance: float32, Rec. 709 primaries.
         coding: ``10bit``, ``pq`` or ``hlg``.
-        transfer: The camera's, by which ``10bit`` is encoded.
+        transfer: Transfer function of the camera, for ``10bit``.
     """
-    from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
+    from warp_ar.kernels.color import encode_codes  # loads Warp: only after the page is open
 
     if coding == "10bit":
         return np.asarray(encode_codes(transfer, radiance))
@@ -296,7 +296,7 @@ def signal_of(radiance: npt.NDArray[np.float32], coding: str, transfer: str) -> 
 
 
 def yuv_picture(signal: npt.NDArray[np.float64], coding: str) -> av.VideoFrame:
-    """Y'CbCr of 10 bits, limited range, without subsampling, of R'G'B' from 0 to 1, (height, width, 3).
+    """Return 10-bit Y'CbCr, limited range, without subsampling, of R'G'B' from 0 to 1, (height, width, 3).
 
     BT.709 for ``10bit``, BT.2020 with non-constant luminance for HDR (BT.709-6 and BT.2020-2, tables of quantisation).
     """
@@ -314,41 +314,41 @@ def yuv_picture(signal: npt.NDArray[np.float64], coding: str) -> av.VideoFrame:
 
 
 class WholeFragments:
-    """File through which FFmpeg writes a video.
+    """File object through which FFmpeg writes a video.
 
-    The file is made aside and takes its name with its first fragment, so that what stood there stays until then.
-    Boxes of MP4 and MOV (a fragment is two, ``moof`` and ``mdat``) are kept back until they are complete and written at
-    once; one that does not fit onto the disk is cut off again. Matroska, whose readers take a cut-off end for the end,
-    is written as it comes. What goes wrong is kept in ``error``, for FFmpeg goes on all the same.
+    The file is written under a temporary name and gets its final name with its first fragment, so that an existing file
+    stays until then. Boxes of MP4 and MOV (a fragment is ``moof`` and ``mdat``) are buffered until complete and written
+    at once; a box that does not fit on the disk is removed again. Matroska, whose readers accept truncated files, is
+    written directly. Errors are stored in ``error``, because FFmpeg continues regardless.
     """
 
     def __init__(self, path: pathlib.Path, *, boxes: bool) -> None:
-        """Make the file.
+        """Create the file.
 
         Args:
-            path: Its name at last.
-            boxes: Whether it is made of boxes, as MP4 and MOV are.
+            path: Final path of the file.
+            boxes: True for formats made of boxes, such as MP4 and MOV.
 
         Raises:
-            OSError: It cannot be made.
+            OSError: The file cannot be created.
         """
         self._path, self._boxes = pathlib.Path(os.path.realpath(path)), boxes
         part = name_aside(self._path)
         self._part: pathlib.Path | None = part
         try:
             self._file = create_new(part)
-        except BaseException:  # a signal, when the file may be there already
+        except BaseException:  # a signal, when the file may exist already
             with contextlib.suppress(OSError):
                 part.unlink()
             raise
         self._pending = bytearray()
-        self._start = self._size = self._at = 0  # of what is pending; of the file; where FFmpeg is
+        self._start = self._size = self._at = 0  # position of the pending data, size of the file, FFmpeg's position
         self._closed = False
         self.error: OSError | None = None
-        """Error that ended the writing; nothing has been written since."""
+        """Error that ended the writing; nothing was written afterwards."""
 
     def write(self, data: bytes) -> int:
-        """Take bytes at the current place."""
+        """Write bytes at the current position."""
         if self.error is not None:
             return len(data)
         if self._at != self._start + len(self._pending):
@@ -360,7 +360,7 @@ class WholeFragments:
         return len(data)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place, or tell the size."""
+        """Change the position, or return the size."""
         size = max(self._size, self._start + len(self._pending))
         if whence == _SEEK_SIZE:
             return size
@@ -368,11 +368,11 @@ class WholeFragments:
         return self._at
 
     def tell(self) -> int:
-        """Return FFmpeg's place in the file."""
+        """Return FFmpeg's position in the file."""
         return self._at
 
     def read(self, size: int = -1) -> bytes:
-        """Read at the current place: FFmpeg reads back what it finishes."""
+        """Read at the current position: FFmpeg reads back data when it finishes the file."""
         self._flush(everything=True)
         data = os.pread(self._file, max(self._size - self._at, 0) if size < 0 else size, self._at)
         self._at += len(data)
@@ -396,22 +396,22 @@ class WholeFragments:
         self._start += length
         self._size = max(self._size, self._start)
         if self._part is not None and (_MEDIA[self._boxes] in data):
-            # Where an open file cannot be renamed, it takes its name when it is closed.
+            # Where open files cannot be renamed, it is renamed when it is closed.
             with contextlib.suppress(PermissionError):
                 take_name(self._part, self._path)
                 self._part = None
 
     def check(self) -> None:
-        """Raise what ended the writing, if anything did.
+        """Raise the error that ended the writing, if any.
 
         Raises:
-            OSError: The file could not be written on.
+            OSError: Writing failed.
         """
         if self.error is not None:
             raise OSError(*self.error.args) from self.error
 
     def close(self) -> None:
-        """Write what is left and let the file go; one that holds nothing is removed."""
+        """Write remaining data and close the file; an empty file is removed."""
         if self._closed:
             return
         self._closed = True
@@ -433,7 +433,7 @@ class WholeFragments:
 
 
 def _whole_boxes(data: bytearray) -> int:
-    """Bytes of complete boxes at the start; a ``moof`` waits for the ``mdat`` behind it."""
+    """Return the length of complete boxes at the start; a ``moof`` is complete only with the ``mdat`` after it."""
     at = whole = 0
     while at + 8 <= len(data):
         size = int.from_bytes(data[at : at + 4], "big")

@@ -1,7 +1,6 @@
-"""Frames as a camera that other programs open: a virtual camera, by ``pyvirtualcam`` of the extra ``virtual-camera``.
+"""Frames as a virtual camera that other programs open, by ``pyvirtualcam`` from the extra ``virtual-camera``.
 
-On Linux that is a device of v4l2loopback, on macOS and Windows the virtual camera of OBS. What is
-written to it is shown at once.
+On Linux this is a v4l2loopback device, on macOS and Windows the virtual camera of OBS. Frames are shown immediately.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ def _load() -> Any:
 
 
 class VirtualCameraSink(Sink):
-    """A virtual camera of this machine.
+    """Virtual camera of this machine.
 
     Args:
-        device: Its name, such as ``/dev/video4``; None: the first that there is.
-        fps: Frames per second that it tells.
+        device: Name of the device, such as ``/dev/video4``; None: the first one.
+        fps: Frames per second reported by the device.
         size: (width, height) in pixels.
-        paced: Whether `write` waits until it is the frame's time.
+        paced: True if `write` waits for the frame's time.
 
     Raises:
         SinkError: There is no such device, or it is in use.
@@ -52,7 +51,7 @@ class VirtualCameraSink(Sink):
         """Show the frame.
 
         Raises:
-            SinkError: It is no frame of the camera's size, the camera is closed, or the device does not take it.
+            SinkError: The image is no frame of the camera's size, the camera is closed, or the device refuses it.
         """
         check_image(image)
         if image.shape[1::-1] != self._size:
@@ -69,7 +68,7 @@ class VirtualCameraSink(Sink):
         self.written += 1
 
     def close(self) -> None:
-        """Let the device go."""
+        """Close the device."""
         camera, self._camera = self._camera, None
         if camera is not None:
             camera.close()

@@ -1,6 +1,6 @@
-"""Address of the page: as it is printed, the sockets that listen there, and its certificate.
+"""Address of the page: its printed form, its listening sockets, and its certificate.
 
-A browser opens its camera only to this machine or over TLS.
+Browsers allow camera access only on the local machine or over TLS.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ def make_context(host: str) -> ssl.SSLContext:
 
 LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 EVERYWHERE: Final = ("0.0.0.0", "::", "")
-"""Not an address, but all that this machine has."""
+"""Host names that mean all addresses of this machine."""
 
 
 def own_address() -> str | None:
-    """Address of this machine on its network; None without one."""
+    """Return the address of this machine on its network; None without one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # an address for documentation: it finds the way out and sends nothing
@@ -87,24 +87,27 @@ class Address:
     """Address to listen on."""
     port: int = 8720
     token: str | None = None
-    """Secret that the page's address must hold; None asks for none."""
+    """Secret that must be in the page's address; None: no secret is required."""
     tls: ssl.SSLContext | None = None
     origins: tuple[str, ...] = ()
-    """Other sites' pages that may ask for the light."""
+    """Origins of other sites whose pages may request the light."""
 
     @property
     def loopback(self) -> bool:
-        """Reachability from this machine alone."""
+        """True if the page is reachable from this machine only."""
         return self.host in LOOPBACK
 
     @property
     def url(self) -> str:
-        """The page's address as it is printed."""
+        """Return the page's address as it is printed."""
         return self._url("localhost" if self.host in EVERYWHERE else self.host)
 
     @property
     def outside_url(self) -> str | None:
-        """The same for other machines; None where they cannot reach the page, or this one's address is not known."""
+        """Return the page's address for other machines.
+
+        Return None if they cannot reach it, or this machine's address is unknown.
+        """
         own = own_address() if self.host in EVERYWHERE else None if self.loopback else self.host
         return None if own is None else self._url(own)
 
@@ -115,7 +118,7 @@ class Address:
 
 
 def listen(host: str, port: int, tries: int) -> socket.socket:
-    """Listen at an address, at the first port that is free.
+    """Listen at the first free port of an address.
 
     Args:
         host: Address, or a name, of whose addresses the first is taken.

@@ -1,7 +1,7 @@
-"""Budget of the page: methods that a time per frame buys on this device, with the error of the picture.
+"""Time budget of the page: the methods with the smallest error within a time per frame on this device.
 
-Errors come from the cost table, costs from measurements on this device, both as for ``--quality auto``; they are
-measured here one method at a time between other work, so that frames and edits go on meanwhile.
+Errors come from the cost table, costs from measurements on this device, as for ``--quality auto``. Here one method is
+measured at a time between other work, so that frames and edits continue.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from warp_ar.viewer.protocol import Notify, begin, failure
 START: Final = dataclasses.replace(BASE, name=AUTO)
 """Quality under a budget until something can be chosen."""
 _COST_FRAMES: Final = 30
-"""Frames whose median tells what a preset costs."""
+"""Number of frames whose median time is a preset's cost."""
 _TOLD: Final = 0.03
-"""Share of the measurements after which the rest is estimated."""
+"""Share of the measurements after which the remaining time is estimated."""
 _SETTLED: Final = 10
-"""Frames of a new pipeline that do not count."""
+"""Number of first frames of a new pipeline that are ignored."""
 
 
 class BudgetSetting:
-    """Holds the budget and its choice. The thread that lights frames calls its methods, unless they say otherwise."""
+    """Budget and resulting choice of methods. Methods are called by the frames' thread, unless stated otherwise."""
 
     def __init__(self, notify: Notify, folder: Path | None = None) -> None:
         """Start switched off.
@@ -71,7 +71,7 @@ class BudgetSetting:
 
     @property
     def measuring(self) -> bool:
-        """True while costs are being measured: frames do well to leave time for that."""
+        """True while costs are being measured; frames should then leave time for it."""
         return self._progress is not None
 
     def switch(self, budget: float | None) -> None:
@@ -134,10 +134,10 @@ class BudgetSetting:
         self._controller, self._offer = controller, self._list(controller, costs)
 
     def choose(self, milliseconds: float | None, now: float) -> Quality | None:
-        """Return the quality under the budget, or None while that is not known or there is no budget.
+        """Return the quality under the budget; None if it is unknown or there is no budget.
 
         Args:
-            milliseconds: Time of the last frame; None if it says nothing about the present choice.
+            milliseconds: Time of the last frame; None if it does not apply to the present choice.
             now: Seconds on a clock that does not jump.
         """
         controller, budget = self._controller, self.budget
@@ -150,11 +150,11 @@ class BudgetSetting:
         return dataclasses.replace(turn(BASE, controller.settings), name=AUTO)
 
     def observe(self, preset: str, milliseconds: float | None) -> Quality | None:
-        """Note the time of a frame; return the quality from now on, as ``choose`` has it.
+        """Record the time of a frame, and return the quality for the next frames, as ``choose``.
 
         Args:
             preset: Name of the quality that it was lit by.
-            milliseconds: Its time; None if it says nothing about that quality.
+            milliseconds: Time of the frame; None if it does not apply to that quality.
         """
         self._since_restart += 1
         if self.measuring:
@@ -163,15 +163,15 @@ class BudgetSetting:
         return self.choose(milliseconds, time.monotonic())
 
     def note(self, preset: str, milliseconds: float | None) -> None:
-        """Note the time of a frame as what a preset costs; None says nothing."""
+        """Record the time of a frame as a preset's cost; None is ignored."""
         if milliseconds is not None:
             self._preset_ms.setdefault(preset, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
 
     def costs(self) -> dict[str, dict[str, Any]]:
-        """Return each preset's milliseconds a frame: the median here, else the cost table's, scaled by this machine's.
+        """Return each preset's milliseconds per frame: the measured median, else the cost table's, scaled.
 
-        ``frames`` counts those that tell it; of what the table does not have nothing is told until it has run. From any
-        thread.
+        ``frames`` is the number of measured frames. A preset that is not in the table is left out until it has run.
+        Callable from any thread.
         """
         ran = {name: (statistics.median(ms), len(ms)) for name, ms in list(self._preset_ms.items()) if ms}
         ratios = [ran[name][0] / ms for name, ms in self._table.items() if name in ran] or [1.0]

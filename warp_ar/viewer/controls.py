@@ -1,7 +1,7 @@
-"""State that the page's threads share: the source, the wanted scene, its edits and the lock of all these.
+"""State shared by the page's threads: the source, the wanted scene, its edits, and their lock.
 
-A desk of one's own names the camera of its machine. Where there is none, the page says so until a browser's camera
-comes, whose pictures are taken here.
+A user's own scene names a capture device of this machine. If it is absent, the page says so until a browser's camera is
+used instead; its pictures are received here.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ Image = npt.NDArray[np.uint8]
 MOST_EDITS: Final = 100
 """Edits that can be undone."""
 TOGETHER_SECONDS: Final = 1.0
-"""Changes of one value that follow each other so soon are one edit: a drag, a slider."""
+"""Seconds within which successive changes of one value count as one edit, such as dragging a slider."""
 
 
 class History:
-    """Edits in order, each with its words and the state on its other side. Whoever owns it holds a lock."""
+    """Undo history: edits in order, each with a label and the state before or after it. The owner holds a lock."""
 
     def __init__(self) -> None:
         self.done: list[tuple[str, Wanted]] = []
@@ -62,7 +62,7 @@ class History:
             self.done = [*self.done, (label, before)][-MOST_EDITS:]
 
     def move(self, wanted: Wanted, *, back: bool) -> Wanted | None:
-        """Take the last edit back, or make the one again that was taken back last; None where there is none."""
+        """Undo the last edit, or with ``back`` False redo the last undone one; return None without one."""
         source, target = (self.done, self.undone) if back else (self.undone, self.done)
         if not source:
             return None
@@ -87,7 +87,7 @@ REMEDY: Final = "press “My camera”, which opens the camera of the machine th
 
 
 class NoCamera(Source):
-    """One grey picture again and again: pipelines are built meanwhile, and the page says what to do."""
+    """Source that repeats one grey picture, while pipelines are built and the page explains what to do."""
 
     live, length, fps = True, None, 2.0
 
@@ -126,7 +126,7 @@ CONVERGING: Final = (TRACED, DIFFERENCE)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Feed:
-    """Source of frames, with the state that changes together with it."""
+    """Source of frames, with the state that changes together with the source."""
 
     source: Source
     camera: Camera | None = None

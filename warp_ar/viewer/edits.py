@@ -1,6 +1,6 @@
-"""Scenes as the page edits them; every change is checked as a scene file is.
+"""Edits of scenes by the page; every change is checked as in a scene file.
 
-Animations of glTF files are chosen, started, held and made faster without a jump of the pose.
+Animations of glTF files can be chosen, started, paused and accelerated without a jump of the pose.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from warp_ar.viewer.protocol import EFFECTS, Command
 _T = TypeVar("_T")
 
 NONE = -1
-"""Number of no animation: everything stands as the file's nodes do."""
+"""Index for no animation: nodes keep the file's static transforms."""
 _LIGHT_REACH, _STEP, _GOLDEN, _PLACES = 0.03, 0.02, 2.399963, 400
 """Of places for what is new: metres around a light, metres and radians of the spiral's steps, and how many."""
 _DIGITS = 4
@@ -121,7 +121,7 @@ MOST_PARTS: Final = 16
 RULER: Final = 0.1
 """Metres that each ruler of the card has in a print at true scale."""
 _SCALES: Final = (0.5, 1.5)
-"""Least and largest ratio of a ruler's length to what it should be: beyond these it was read wrong."""
+"""Smallest and largest ratio of a ruler's measured to nominal length; others are misread."""
 
 _LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "probe": "probes"}
 # No key that names a file is among them.
@@ -316,7 +316,7 @@ def set_animation(scene: Scene, index: int, key: str, value: float, seconds: flo
 
 @dataclasses.dataclass(frozen=True)
 class Wanted:
-    """State that the viewers want to see."""
+    """State that viewers want to see."""
 
     scene: Scene
     """The scene, edited."""
@@ -439,7 +439,7 @@ def make_edit(command: Command, original: Wanted, seconds: float = 0.0) -> tuple
 
 
 def moved(value: _T, place: Callable[[Path], Path]) -> _T:
-    """Return a scene, or a part of one, whose files are elsewhere."""
+    """Return a scene, or a part of one, with changed file paths."""
     if isinstance(value, Path):
         return cast(_T, place(value))
     if isinstance(value, tuple) and list(files_of(value)):
@@ -541,7 +541,7 @@ def _apart(scene: Scene, item: Any) -> Any:
 
 
 def duplicate_part(scene: Scene, part: str, index: int) -> Scene:
-    """Return the scene with another object, light or proxy that is as one of it, beside that one."""
+    """Return the scene with a copy of an object, light or proxy beside the original."""
     return add_item(scene, part, _items(scene, part, index)[index])
 
 

@@ -1,4 +1,4 @@
-"""Admission of connections: silent and slow ones are cut, and never take the places of those who have shown the token.
+"""Admission of connections: silent and slow ones are closed, and cannot displace those that have sent the token.
 
 A connection is *admitted* once one whole request of it has passed the server's checks (its site, and the token where
 there is one). Until then it has ``HEADER_SECONDS``, the TLS handshake included; afterwards as long between requests,
@@ -195,7 +195,7 @@ class Gate:
         finally:
             connection.answering, connection.deadline = False, time.monotonic() + self.header_seconds
             if connection in self.connections:
-                self.connections[connection] = self.connections.pop(connection)  # who was answered last goes last
+                self.connections[connection] = self.connections.pop(connection)  # most recently answered: last
 
     def _make_room(self, newest: Connection) -> None:
         everyone = list(self.connections)

@@ -1,4 +1,4 @@
-"""Host of the page: takes viewers' commands, lights their frames, and makes the files that they can save."""
+"""Host of the page: executes viewers' commands, lights frames, and makes files for download."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _NOTICE_SECONDS: Final = 5.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lit:
-    """One frame as the viewers get it."""
+    """Lit frame with its metadata, as sent to viewers."""
 
     id: int
     """Number of the frame since the page was started."""
@@ -88,7 +88,10 @@ class Lit:
 
 
 class Host:
-    """Frames that viewers steer. Every method may be called from any thread, but for ``run``, which lights them."""
+    """Frames controlled by viewers.
+
+    Every method may be called from any thread, except ``run``, which lights the frames.
+    """
 
     def __init__(
         self,
@@ -157,7 +160,7 @@ class Host:
         self.latest: Lit | None = None
         """The newest frame."""
         self.light_state: LightState | None = None
-        """The environment as it was a moment ago, with its status; None while it is not known."""
+        """The environment a moment ago, with its status; None while unknown."""
         if by_card:
             self._setup.step("light")
         self._dropped, self._dropping = DroppedFiles(folder), threading.Lock()
@@ -381,7 +384,7 @@ class Host:
         }
 
     def _missing(self) -> dict[str, str] | None:
-        """Return why there are no frames, why the marker is not seen in them, or why no object is."""
+        """Return the reason for missing frames, a marker that is not visible, or objects outside the picture."""
         absent = self.no_camera  # once: another source may come meanwhile
         return self._setup.guide() if absent is None else page_record(absent.finding)
 

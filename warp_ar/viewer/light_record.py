@@ -1,4 +1,4 @@
-"""Content of ``/light.json``: harmonics of the environment, its key light, what is known of both. Loads Warp."""
+"""Content of ``/light.json``: harmonics of the environment, its strongest emitter, and recovery status. Loads Warp."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from warp_ar.signature import PROGRAM
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LightState:
-    """The light of a moment."""
+    """Light at one moment."""
 
     radiance: npt.NDArray[np.float32]
     """Latlong in this program's axes, linear RGB in camera values, (rows, columns, 3)."""

@@ -1,8 +1,7 @@
-"""The page's pipelines: one lights the frames, one more what they are compared with; both follow what is wanted.
+"""Pipelines of the page: one lights the frames, another the comparison picture; both follow the wanted state.
 
-The reference of a held frame is path-traced a slice of samples at a time, in the light, pose and scene of the frame as
-it was lit last. Whatever moves on (frames that flow, an edit, another plan) drops it, and the next held frame begins
-anew.
+The reference of a held frame is path-traced in slices of samples, with the light, pose and scene of the last lit frame.
+Any change (new frames, an edit, another plan) drops it, and the next held frame starts again.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def make_target(wanted: Wanted, feed: Feed) -> Target:
 
 
 class Lighting:
-    """Follows what is wanted. The thread of the frames calls it; properties may be read by any."""
+    """Pipelines that follow the wanted state. Called by the frames' thread; properties may be read by any thread."""
 
     def __init__(self, controls: Controls, device: str, notify: Notify, give_up: Callable[[], None]) -> None:
         """Start without a pipeline.
@@ -261,7 +260,7 @@ def _place(target: Target) -> Any:
 
 
 FULL_SCALE: Final = 0.2
-"""Difference, of full scale, that has the last colour."""
+"""Difference, relative to full scale, that has the last colour."""
 SLICE_SECONDS: Final = 0.04
 """Seconds of sampling between two looks at viewers' requests."""
 SHOWN_SECONDS: Final = 0.3

@@ -56,7 +56,7 @@ the ``light`` from the card."""
 
 
 class ProtocolError(WarpArError, ValueError):
-    """A message that no page of ours sends."""
+    """Message that the page never sends."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Picture:
 
 
 Check = Callable[[Any], Any]
-"""Function that returns a value of a message as the program takes it, or raises a ProtocolError."""
+"""Function that converts a value of a message, or raises a ProtocolError."""
 
 
 def _expect(fits: bool, words: str) -> None:

@@ -1,4 +1,4 @@
-"""Faults of the set-up whose frames are shown, in words while they are lit; ball, response and camera, measured."""
+"""Checks of the set-up while its frames are lit, and measurements of ball, response and camera."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ from warp_ar.viewer.light_record import written
 from warp_ar.viewer.protocol import Notify, begin, failure
 
 KEPT: Final = 24
-"""Frames that are looked at: the newest, ``STEP_SECONDS`` from each other."""
+"""Number of kept frames: the newest, with ``STEP_SECONDS`` between them."""
 STEP_SECONDS: Final = 0.4
 LOST_SECONDS: Final = 1.5
-"""Time without the marker after which the reason is looked for."""
+"""Seconds without the marker after which the reason is searched."""
 AGAIN_SECONDS: Final = 3.0
-"""Time between two such looks, and between two for a ball that is missing."""
+"""Seconds between two such tests, and between two tests for a missing ball."""
 BALL_SECONDS: Final = 10.0
-"""Time between two looks for a ball that is seen: each takes a third of a second."""
+"""Seconds between two tests for a visible ball; each takes a third of a second."""
 PLACES_SECONDS: Final = 1.0
-"""Time between two looks for objects in the picture."""
+"""Seconds between two tests for objects in the picture."""
 FOCAL_FRAMES: Final = 4
 """Frames after which a guessed camera's focal length is first looked for."""
 FOCAL_SPREAD: Final = 0.04
@@ -59,7 +59,7 @@ NO_BALL: Final = Finding(
     "“Light by the card”",
 )
 FEWEST: Final = 3
-"""Frames without which nothing is measured."""
+"""Smallest number of frames for a measurement."""
 PAGE_WORDS: Final = (
     (r"(?:run )?python -m warp_ar\.calibrate camera PICTURES", "press “Calibrate”"),
     (r"python -m warp_ar\.calibrate ball SCENE --write", "press “Measure the ball”"),
@@ -74,7 +74,7 @@ PAGE_WORDS: Final = (
 
 @dataclasses.dataclass
 class _Step:
-    """One thing that the page can ask for."""
+    """Step of the set-up that the page can start."""
 
     work: Callable[[Scene, Look], str]
     """Function that returns its result in words."""

@@ -133,13 +133,13 @@ def _plain(stem: str) -> str:
 
 
 MOST_FILES: Final = 32
-"""Largest number of dropped files in one run; undone edits keep theirs for redo."""
+"""Largest number of dropped files in one run; files of undone edits are kept for redo."""
 MOST_KEPT_BYTES: Final = 1 << 29
 """Largest total of bytes of dropped files in one run: 512 MB."""
 MOST_TRIANGLES: Final = 1_000_000
 """Largest number of triangles of a dropped mesh; more take the page too long."""
 SIZES: Final = (0.02, 0.4)
-"""Metres: least and largest longest side of an object on a desk."""
+"""Smallest and largest longest side of an object, metres."""
 USUAL: Final = 0.12
 """Longest side, metres, given to a mesh of unknown units."""
 PLACE: Final = (0.12, -0.08)
@@ -152,7 +152,7 @@ Edit = tuple[Callable[[Wanted], Wanted], str, str]
 
 
 class DroppedFiles:
-    """Takes files; one at a time."""
+    """Storage of dropped files, one at a time."""
 
     def __init__(self, folder: Path) -> None:
         """Keep files in numbered folders of ``folder``, which must be there."""
