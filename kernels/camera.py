@@ -1,4 +1,4 @@
-"""The camera: where the frame shows a point."""
+"""Projection of points by the camera, with lens distortion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def distort(point: wp.vec2, k: vec8) -> wp.vec2:
-    """Return where the lens maps a normalised image point: OpenCV's rational model, k1 k2 p1 p2 k3 k4 k5 k6."""
+    """Distort a normalised image point (x / z, y / z) by OpenCV's rational model, k1 k2 p1 p2 k3 k4 k5 k6."""
     x = point[0]
     y = point[1]
     r2 = x * x + y * y
@@ -24,7 +24,7 @@ def distort(point: wp.vec2, k: vec8) -> wp.vec2:
 
 @wp.func
 def project(params: FrameParams, from_camera: wp.vec3) -> wp.vec3:
-    """Pixel and depth of a point given relative to the camera in world axes; only a positive depth has a pixel."""
+    """Return (column, row, depth) of a point relative to the camera, in world axes; pixels need a positive depth."""
     p = wp.transpose(params.world_from_camera) * from_camera
     if p[2] <= 0.0:
         return wp.vec3(0.0, 0.0, p[2])

@@ -3,8 +3,8 @@
 A Warp CPU launch uses one thread, so the scheduler splits a pass into bands of rows that threads take side by side.
 Every per-row kernel therefore takes ``row_start`` as its first input and adds it to its first thread index.
 
-Launchers go through this module, so that their launches can be noted instead of done (``noting``): from the notes the
-scheduler learns which modules must be compiled, and on CPU what native threads are to call.
+Launchers use this module, so that launches can be recorded instead of executed (``noting``). From these notes the
+scheduler finds the modules to compile and, on CPU, the calls that native threads make.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ Rows = tuple[int, int]
 MOST_REGISTERS = 80
 """Registers of a CUDA thread in kernels that trace rays.
 
-They wait for memory most of their time. Left alone they take 120 to 255, with which a multiprocessor of 65,536 holds
-one or two blocks of 256 threads; with three it has others to go on with, and gains more than spilling costs.
+These kernels mostly wait for memory. Without a limit they take 120 to 255 registers, with which a multiprocessor of
+65,536 holds one or two blocks of 256 threads. A third block hides more latency than spilled registers cost.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class Note:
-    """A launch, or a copy, that was asked for while ``noting``."""
+    """Record of a launch or a copy, made while ``noting``."""
 
     kernel: wp.Kernel | None
-    """None: a copy."""
+    """Kernel of the launch; None for a copy."""
     rows: Rows | None
-    """Band that the launcher passed on."""
+    """Band of rows that the launcher was given."""
     do: Callable[[], None]
-    """Does it."""
+    """Function that executes the launch or copy."""
     record: Callable[[], wp.Launch] | None = None
-    """Loads the kernel and packs its arguments; the launch is over all rows, its first input being 0."""
+    """Function that loads the kernel and packs its arguments, for a launch over all rows with ``row_start`` 0."""
     arrays: tuple[wp.array, wp.array] | None = None
     """Target and source of a copy."""
     block_dim: int = 256
     """Threads of a block, on CUDA."""
     tiles: bool = False
-    """True if it may not meet another that uses tiles."""
+    """True if it must not run at the same time as another launch that uses tiles."""
 
 
 _NOTES = threading.local()
@@ -54,7 +54,7 @@ _NOTES = threading.local()
 
 @contextlib.contextmanager
 def noting() -> Iterator[list[Note]]:
-    """This thread's launches are noted in the list, and nothing is done."""
+    """Record this thread's launches in the returned list, without executing them."""
     before = getattr(_NOTES, "list", None)
     _NOTES.list = notes = []
     try:
@@ -64,7 +64,7 @@ def noting() -> Iterator[list[Note]]:
 
 
 def do_or_note(note: Note) -> None:
-    """Do what a note says, or leave it noted."""
+    """Execute a note, or append it to the list of ``noting``."""
     notes = getattr(_NOTES, "list", None)
     if notes is None:
         note.do()
@@ -73,7 +73,7 @@ def do_or_note(note: Note) -> None:
 
 
 def device_of(device: wp.DeviceLike, arguments: Sequence[Any]) -> Any:
-    """Return a device, or where none is given that of a kernel's first array, which may lie in a struct."""
+    """Return the device; if None, that of the first array among the arguments, which may be a field of a struct."""
     if device is None:
         held = [part for one in arguments for part in (one, *getattr(one, "__dict__", {}).values())]
         device = next(part.device for part in held if isinstance(part, wp.array))
@@ -128,7 +128,7 @@ def launch_rows(
         inputs: Arguments after ``row_start`` and before the outputs.
         outputs: Arrays that the kernel writes.
         rows: Band to launch; None means all rows.
-        device: Where the arrays live; None: as ``device_of`` says.
+        device: Device of the arrays; None: found by ``device_of``.
         stream: CUDA stream; None means the device's current one.
     """
     device = device_of(device, [*outputs, *inputs])
@@ -147,9 +147,9 @@ def launch_rows(
 
 
 def pixel_run(device: wp.DeviceLike) -> int:
-    """Return how many pixels of a row one thread does, where most pixels take next to no time.
+    """Return the number of pixels of a row that one thread computes, for kernels in which most pixels are cheap.
 
-    To begin a thread costs a CPU as much as such a pixel. On CUDA neighbours are read side by side by neighbours.
+    On a CPU starting a thread costs as much as such a pixel. On CUDA neighbouring threads read neighbouring pixels.
     """
     return 32 if wp.get_device(device).is_cpu else 1
 
@@ -166,12 +166,13 @@ def row_launcher(
     """Return ``launcher(*configs, *inputs, *outputs, rows=None, **options)`` of a kernel that takes ``row_start``.
 
     Args:
-        kernel: Kernel, or the factory that makes it of configurations, the launcher's first arguments.
-        configs: Number of these.
+        kernel: Kernel, or a factory that makes it from configurations, the launcher's first arguments.
+        configs: Number of configurations.
         outputs: Number of the kernel's outputs, the launcher's last arguments.
-        like: Extent of the launch, or the array that has it, of the kernel's arguments; None: the first output.
-        runs: Whether each thread does a run of pixels of one row, whose length is the kernel's last input.
-        **options: As for ``launch_rows``, of all launches.
+        like: Function of the kernel's arguments that returns the launch's shape, or an array of that shape; None: the
+            first output.
+        runs: Whether each thread computes a run of pixels of one row, whose length is the kernel's last input.
+        **options: Options of ``launch_rows`` for all launches.
     """
 
     def launcher(*given: Any, rows: Rows | None = None, **more: bool) -> None:
@@ -188,20 +189,20 @@ def row_launcher(
     return launcher
 
 
-# On CPU a module's tiles lie on the stack of the kernel that began last, for there is one pointer to them per module:
-# two threads in kernels of that module, with tiles or without, take each other's (seen with 1.19 on x86-64: crashes).
+# On CPU a module has one pointer to its tiles, which lie on the stack of the kernel that began last. Two threads in
+# kernels of one module, with or without tiles, use each other's tiles (with Warp 1.19 on x86-64 this crashes).
 _CPU_TILES = threading.Lock()
 
 
 def alone_with_tiles() -> contextlib.AbstractContextManager[Any]:
-    """Held by who runs kernels with tiles on the CPU other than by ``launch_tiles``."""
+    """Return a lock that callers hold while they run kernels with tiles on the CPU without ``launch_tiles``."""
     return _CPU_TILES
 
 
 def tile_kernel(function: Callable[..., None]) -> Any:
-    """Declare a kernel that uses tiles: in a module of its own, where no other kernel moves them.
+    """Declare a kernel that uses tiles, in a module of its own, so that no other kernel moves its tiles.
 
-    It may be launched by ``launch_tiles`` only, which sees to it that it does not meet itself.
+    It may be launched by ``launch_tiles`` only, which prevents concurrent launches.
     """
     return wp.kernel(function, enable_backward=False, module="unique")
 
@@ -225,8 +226,8 @@ def launch_tiles(
         inputs: Arguments before the outputs.
         outputs: Arrays that the kernel writes.
         block_dim: Threads per block on CUDA; on CPU a block is one thread.
-        device: Where the arrays live; None: as ``device_of`` says.
-        rows: Band of blocks along the first axis; None means all, of a kernel that knows no bands.
+        device: Device of the arrays; None: found by ``device_of``.
+        rows: Band of blocks along the first axis; None means all blocks of a kernel without ``row_start``.
     """
     device = device_of(device, [*outputs, *inputs])
 

@@ -1,13 +1,12 @@
 """Linear radiance of a pixel of the camera's frame.
 
-A frame of 8-bit codes is decoded by its table. Of a frame that came with more than 8 bits the linear picture lies
-beside the codes: where there is one, it is read in their place. The array is empty where there is none, which all
-threads of a launch find alike, so that one kernel serves both.
+A frame of 8-bit codes is decoded by its table. A frame of more than 8 bits has its linear radiance in a second array,
+which is read in place of the codes; for 8-bit frames the array is empty. All threads of a launch take the same branch,
+so one kernel serves both. More bits matter in the dark: a desk of radiance 0.0007 has the sRGB code 2.3, and read as
+code 2 it is 0.00061, 13 % too dark.
 
-A dark desk of radiance 0.0007 has the sRGB code 2.3: read as code 2 it is 0.00061, 13 % too dark.
-
-Where codes themselves are asked for (a mean of codes is not swayed by a few highlights), ``cut_luma`` gives what the
-8-bit luma of a pixel lacks of that of its linear radiance.
+For methods that need codes (a mean of codes is less affected by highlights), ``cut_luma`` returns the difference
+between the luma of a pixel's linear radiance and its 8-bit luma.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from warp_ar.kernels.structs import Picture
 wp.set_module_options({"enable_backward": False})
 
 MOST_CUT = wp.constant(wp.float32(2.0))
-"""Codes that ``cut_luma`` gives at most: rounding of channels and luma is 1, converters differ by 1 more."""
+"""Largest result of ``cut_luma``, in codes: rounding of channels and luma is 1, converters differ by 1 more."""
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
 
@@ -29,7 +28,7 @@ mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
 def pixel_radiance(
     frame: wp.array2d[wp.vec3ub], table: wp.array[wp.vec3], linear: wp.array2d[wp.vec3], row: wp.int32, column: wp.int32
 ) -> wp.vec3:
-    """Radiance of a pixel: of the linear picture, or of the codes where that is empty."""
+    """Return the radiance of a pixel, from the linear array or, if that is empty, from the codes."""
     if linear.shape[0] > 0:
         return linear[row, column]
     return decode(table, frame[row, column])
@@ -37,13 +36,13 @@ def pixel_radiance(
 
 @wp.func
 def shown_radiance(picture: Picture, row: wp.int32, column: wp.int32) -> wp.vec3:
-    """Radiance of a pixel of a picture."""
+    """Return the radiance of a pixel of a picture."""
     return pixel_radiance(picture.frame, picture.decode_table, picture.linear, row, column)
 
 
 @wp.func
 def between_codes(table: wp.array[wp.vec3], value: wp.float32, code: wp.uint8, channel: wp.int32) -> wp.float32:
-    """Distance of a linear value from its 8-bit code, in codes; exactly 0 where it is that code's value."""
+    """Return the distance of a linear value from the value of its 8-bit code, in codes."""
     here = wp.int32(code)
     beside = wp.where(value > table[here][channel], wp.min(here + 1, 255), wp.max(here - 1, 0))
     step = wp.abs(table[beside][channel] - table[here][channel])
@@ -56,9 +55,9 @@ def between_codes(table: wp.array[wp.vec3], value: wp.float32, code: wp.uint8, c
 def cut_luma(
     frame: wp.array2d[wp.vec3ub], table: wp.array[wp.vec3], linear: wp.array2d[wp.vec3], row: wp.int32, column: wp.int32
 ) -> wp.float32:
-    """Return the part of a linear picture's luma that its 8-bit luma (``summed_area.intensity``) lacks, in codes.
+    """Return the luma of a pixel's linear radiance less its 8-bit luma (``summed_area.intensity``), in codes.
 
-    Exactly 0 without a linear picture, and where that is what the codes say. Light above 1 counts as 1.
+    It is exactly 0 for frames of 8 bits, and where the radiance equals that of the codes. Radiance above 1 counts as 1.
     """
     if linear.shape[0] == 0:
         return wp.float32(0.0)
@@ -77,19 +76,19 @@ def cut_luma(
 
 @wp.func
 def keep_linear(table: wp.array[wp.vec3], value: wp.vec3) -> wp.vec3:
-    """A pixel of a linear frame, in the place of ``decode``."""
+    """Return a pixel of a linear frame unchanged; replaces ``decode`` in kernels for linear frames."""
     return value
 
 
 @wp.func
 def clip_levels(table: wp.array[wp.vec3]) -> mat23:
-    """Levels at which the channels of a linear frame clip, alone and beside another one that does."""
+    """Return the values from which channels of a linear frame clip, alone and beside another clipped channel."""
     return mat23(table[0][0], table[0][1], table[0][2], table[1][0], table[1][1], table[1][2])
 
 
 @wp.func
 def is_at_clipping(value: wp.vec3, levels: mat23) -> wp.vec3:
-    """1 in the channels of a linear pixel that clip, in the place of ``is_saturated``."""
+    """Return 1 in the clipped channels of a linear pixel, else 0; replaces ``is_saturated`` for linear frames."""
     beside = wp.bool(False)
     for channel in range(3):
         beside = beside or value[channel] >= levels[0, channel]

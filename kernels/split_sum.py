@@ -1,7 +1,7 @@
-"""Split sum: what a rough specular surface reflects of a white sky, as a table over roughness and angle.
+"""Split sum: directional albedo of a rough specular surface, as a table over roughness and angle.
 
-``sample_dfg`` returns (scale, bias): the specular reflectance of the GGX surface under a white sky is F0 scale + bias
-[Karis13]. One scattering loses energy on rough surfaces; ``energy_compensation`` puts it back: a white metal keeps a
+``sample_dfg`` returns (scale, bias): the directional albedo of the GGX surface is F0 scale + bias [Karis13]. A model of
+single scattering loses energy on rough surfaces. ``energy_compensation`` adds it back, so that a white metal keeps a
 white furnace white.
 
 References:
@@ -35,7 +35,7 @@ def integrate_dfg_kernel(
     i, j = wp.tid()
     roughness = wp.float32(i) / wp.float32(dfg_out.shape[0] - 1)
     alpha = roughness * roughness
-    # The limit at grazing view exists, the formulas do not like it.
+    # The limit at grazing view exists, but the formulas divide by 0 there.
     cos_theta = wp.max(wp.float32(j) / wp.float32(dfg_out.shape[1] - 1), 1.0e-3)
     wo = wp.vec3(wp.sqrt(1.0 - cos_theta * cos_theta), 0.0, cos_theta)
     masking = ggx_masking(wo, alpha)
@@ -72,13 +72,13 @@ def sample_dfg(table: wp.array2d[wp.vec2], n_dot_v: wp.float32, roughness: wp.fl
     return top * (1.0 - fy) + bottom * fy
 
 
-# Of light that meets the facets a share E leaves after one scattering. What is left has been weighed with F0 once more,
-# and of it a share s leaves each time: the sum over all scatterings is
+# A share E of the light that meets the facets leaves after one scattering. The rest is multiplied by F0 at each further
+# scattering, after which a share s of it leaves. The sum over all scatterings is
 #
 #     E F0 + (1 - E) F0^2 (s + s (1 - s) F0 + ...) = E F0 (1 + F0 (1 / E - 1) s / (1 - F0 (1 - s))).
 #
-# s = 1, all of it leaves the second time, is [Turquin19]; s = E, it is as deep as the first time, [FA19]. It lies
-# between: the light is on its way up. With
+# With s = 1, all light leaves at the second scattering, it is [Turquin19]; with s = E, the chance to leave does not
+# change, [FA19]. The truth lies between, because scattered light is on its way up. With
 #
 #     | s = sqrt(E) |
 #
@@ -86,9 +86,9 @@ def sample_dfg(table: wp.array2d[wp.vec2], n_dot_v: wp.float32, roughness: wp.fl
 # +18 and -12 %. At F0 = 1 the bracket is 1 / E, whatever s is: a white furnace stays white.
 @wp.func
 def energy_compensation(dfg: wp.vec2, f0: wp.vec3) -> wp.vec3:
-    """Factor on the specular part that adds what scatters more than once, as derived above.
+    """Return the factor on the specular part that adds light of multiple scattering, as derived above.
 
-    E = scale + bias is what a surface with F0 = 1 reflects after one scattering. The factor holds for environment light
+    E = scale + bias is the single-scattering albedo of a surface with F0 = 1. The factor holds for environment light
     and virtual lights alike.
     """
     once = wp.max(dfg[0] + dfg[1], 1.0e-3)

@@ -1,13 +1,13 @@
-"""Pictures on surfaces: packed texels with mip levels, samplers, and how wide a pixel is on the surface.
+"""Textures: packed texels with mip levels, samplers, and selection of levels by the footprint of a pixel.
 
-Texels are RGBA of 8 bits in one array, level after level, picture after picture; a table turns codes into linear
-values. A level is picked by the width of the ray where it meets the surface, as a ray cone has it [AMNMW19]: a pixel of
-angle s sees s t / cos of the surface, and a texel of level l covers 2^l / (density size), so
+Texels are RGBA of 8 bits in one array, level after level, texture after texture; a table maps codes to linear values.
+The level is chosen by the width of the ray cone at the surface [AMNMW19]: a pixel of angle s covers the length
+s t / cos of the surface, and a texel of level l the length 2^l / (density size), so
 
     l = log2(s t / cos * density * size).
 
-Divided by the cosine, the level is that of the footprint's long axis: nothing shimmers, and pictures blur at grazing
-angles.
+Because of the division by the cosine, the level is that of the footprint's long axis: textures do not shimmer, but blur
+at grazing angles.
 
 References:
     [AMNMW19] Akenine-Moeller et al., "Texture Level of Detail Strategies for Real-Time Ray Tracing", Ray Tracing Gems
@@ -22,13 +22,13 @@ from warp_ar.kernels.structs import CLAMP, MIRRORED, RayScene, Texture
 
 wp.set_module_options({"enable_backward": False})
 
-# Cosine below which a footprint grows no more: 16 texels along one axis for one along the other.
+# Least cosine by which a footprint is divided: 16 texels along one axis for one along the other.
 MIN_SLANT = wp.constant(wp.float32(1.0 / 16.0))
 
 
 @wp.struct
 class SurfacePoint:
-    """Point at which a ray meets a surface, as pictures see it."""
+    """Point at which a ray meets a surface, with the data for texture look-ups."""
 
     uv: wp.vec2
     uv_second: wp.vec2
@@ -39,7 +39,7 @@ class SurfacePoint:
 
 @wp.func
 def wrap_texel(index: wp.int32, size: wp.int32, mode: wp.int32) -> wp.int32:
-    """Texel inside a picture for one that may lie beyond its border."""
+    """Return the index of a texel inside a texture, for one that may lie beyond its border."""
     if mode == CLAMP:
         return wp.clamp(index, 0, size - 1)
     period = wp.where(mode == MIRRORED, 2 * size, size)
@@ -51,7 +51,7 @@ def wrap_texel(index: wp.int32, size: wp.int32, mode: wp.int32) -> wp.int32:
 
 @wp.func
 def wrap_coordinate(u: wp.float32, mode: wp.int32) -> wp.float32:
-    """A coordinate near the picture, so that it keeps its digits as a texel's number."""
+    """Return an equivalent coordinate near the texture, so that texel indices lose no digits."""
     if mode == CLAMP:
         return wp.clamp(u, -1.0, 2.0)
     if mode == MIRRORED:
@@ -61,7 +61,7 @@ def wrap_coordinate(u: wp.float32, mode: wp.int32) -> wp.float32:
 
 @wp.func
 def fetch_texel(scene: RayScene, texture: Texture, index: wp.int32) -> wp.vec4:
-    """Linear RGBA of a texel."""
+    """Return the linear RGBA of a texel."""
     code = scene.texels[index]
     red = wp.int32(code & wp.uint32(255))
     green = wp.int32((code >> wp.uint32(8)) & wp.uint32(255))
@@ -74,7 +74,7 @@ def fetch_texel(scene: RayScene, texture: Texture, index: wp.int32) -> wp.vec4:
 
 @wp.func
 def sample_level(scene: RayScene, texture: Texture, uv: wp.vec2, level: wp.int32, nearest: wp.bool) -> wp.vec4:
-    """Bilinear lookup in one level; v points up the picture, texel centres lie at half-integers."""
+    """Sample one level bilinearly; v points up in the image, texel centres lie at half-integers."""
     width = texture.width
     height = texture.height
     offset = texture.offset
@@ -84,7 +84,7 @@ def sample_level(scene: RayScene, texture: Texture, uv: wp.vec2, level: wp.int32
         height = wp.max(height / 2, 1)
     x = uv[0] * wp.float32(width)
     y = (1.0 - uv[1]) * wp.float32(height)
-    taps = wp.int32(4)  # variables: the loop stays one, and kernels small
+    taps = wp.int32(4)  # a variable: the loop is not unrolled, and kernels stay small
     fx = float(0.0)
     fy = float(0.0)
     if nearest:
@@ -109,7 +109,7 @@ def sample_level(scene: RayScene, texture: Texture, uv: wp.vec2, level: wp.int32
 
 @wp.func
 def sample_texture(scene: RayScene, index: wp.int32, point: SurfacePoint) -> wp.vec4:
-    """Linear RGBA of a texture at a point, between the two levels that its footprint lies between."""
+    """Return the linear RGBA of a texture at a point, interpolated between the two levels nearest to its footprint."""
     texture = scene.textures[index]
     given = point.uv
     density = point.density[0]
@@ -139,7 +139,7 @@ def sample_texture(scene: RayScene, index: wp.int32, point: SurfacePoint) -> wp.
 def point_of_triangle(
     scene: RayScene, corner: wp.int32, weights: wp.vec2, uv: wp.vec2, width: wp.float32, scale: wp.float32
 ) -> SurfacePoint:
-    """A point of a mesh: what its vertices say, mixed; ``scale`` is that of the shape, ``width`` in metres."""
+    """Return a point of a mesh, with vertex data interpolated; ``scale`` is the shape's, ``width`` in metres."""
     point = SurfacePoint()
     point.uv = uv
     point.color = wp.vec4(1.0, 1.0, 1.0, 1.0)
@@ -158,5 +158,5 @@ def point_of_triangle(
 
 @wp.func
 def slant(cosine: wp.float32) -> wp.float32:
-    """By how much a footprint is longer where the surface is seen at an angle."""
+    """Return the factor by which a footprint is longer if the surface is seen at this cosine."""
     return 1.0 / wp.max(wp.abs(cosine), MIN_SLANT)

@@ -1,10 +1,10 @@
 """Rays through a mesh's triangles by the tree of a ``wp.Mesh``.
 
-The walk is that of ``wp.mesh_query_ray`` [AL09]: from the nearer child to the farther, which waits on a stack. At a
-triangle there is less to do. Warp picks the ray's axes by indices, which puts vectors into local memory, divides anew
-to shear each triangle, and reads a list to find its corners. Here axes and shear are found once for a ray, and corners
-are read where they lie: corner k of face f is point 3 f + k (``warp_ar.scene.ray_mesh``). So kernels that trace also
-have fewer registers to spill. Of Warp's insides it knows ``Mesh``, ``BVH`` and its packed nodes.
+The traversal is that of ``wp.mesh_query_ray`` [AL09]: the nearer child first, the farther one is pushed on a stack. The
+test of a triangle is cheaper. Warp picks the ray's axes by indices, which puts vectors into local memory, divides anew
+to shear each triangle, and reads a list to find its corners. Here axes and shear are computed once per ray, and corner
+k of face f is point 3 f + k (``warp_ar.scene.ray_mesh``). So kernels also spill fewer registers. The code depends on
+Warp's internal ``Mesh``, ``BVH`` and packed nodes.
 
 The test of a triangle is Warp's: watertight [WBW13], edge functions by Kahan's product of differences, whose sign is
 exact. Directions along an axis take 1e-30 for zero: 1 / 0 times a distance of 0 would be no number. Boxes with a margin
@@ -22,7 +22,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 STACK = 32
-"""Nodes that can wait. Above a leaf one waits for each level at most, and Warp's builder ends trees at the 31st."""
+"""Size of the stack: at most one node waits per level above a leaf, and Warp's builder ends trees at level 31."""
 
 _WALK = """
     #if defined(__CUDA_ARCH__)
@@ -140,7 +140,7 @@ _CLOSEST = """
     )
 )
 def find_closest_face(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.vec4:
-    """T of the closest triangle before ``t_max``, its first two barycentric weights, the bits of its number or -1."""
+    """Return t of the closest triangle before ``t_max``, two barycentric weights, and the bits of its index or -1."""
 
 
 @wp.func_native(_WALK.format(stack=STACK, found="", meet="return true;", missed="false"))

@@ -83,7 +83,7 @@ def to_rigid_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
 
 @wp.func
 def intersect_sphere(radius: wp.float32, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
-    """Smallest t on a sphere around the origin, FAR if none.
+    """Return the smallest t on a sphere around the origin, FAR if none.
 
     The discriminant is r^2 - |closest point|^2, not b^2 - ac, and the roots are q / a and c / q: neither cancels
     [HHO19].
@@ -109,7 +109,7 @@ def intersect_sphere(radius: wp.float32, origin: wp.vec3, direction: wp.vec3, t_
 
 @wp.func
 def intersect_box(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
-    """Smallest t on a box around the origin, FAR if none; a ray along a face counts as inside, never as 0 * inf."""
+    """Return the smallest t on a box around the origin, FAR if none; rays along a face count as inside (no 0 * inf)."""
     t_near = -FAR
     t_far = FAR
     for axis in range(3):
@@ -130,7 +130,7 @@ def intersect_box(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: wp.
 
 @wp.func
 def intersect_plane(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
-    """T on the rectangle |x| <= half.x, |y| <= half.y of the plane z = 0, from either side; FAR if none."""
+    """Return t on the rectangle |x| <= half.x, |y| <= half.y of the plane z = 0, from either side; FAR if none."""
     if direction[2] == 0.0:
         return FAR
     t = -origin[2] / direction[2]
@@ -141,7 +141,7 @@ def intersect_plane(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: w
 
 @wp.func
 def enter_mesh(half: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.float32:
-    """T at which a ray enters the bounding sphere of a mesh, 0 if it starts inside, FAR if it passes by."""
+    """Return t at which a ray enters a mesh's bounding sphere, 0 if it starts inside, FAR if it misses."""
     a = wp.dot(direction, direction)
     b = -wp.dot(origin, direction)
     nearest = origin + (b / a) * direction
@@ -215,7 +215,7 @@ def box_uv(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec2:
 
 @wp.func
 def onto_box(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec3:
-    """A point near a box put onto the face of that normal."""
+    """Project a point near a box onto the face with the given normal."""
     return wp.vec3(
         wp.where(normal[0] != 0.0, normal[0] * half[0], point[0]),
         wp.where(normal[1] != 0.0, normal[1] * half[1], point[1]),
@@ -239,7 +239,7 @@ def sphere_uv(normal: wp.vec3) -> wp.vec2:
 
 @wp.func
 def surface_key(shape: Shape, index: wp.int32, geometric_normal: wp.vec3) -> wp.int32:
-    """Number that points on one flat surface share: the shape's ``index``, and the face of a box."""
+    """Return a number that points on one flat surface share, from the shape's ``index`` and the face of a box."""
     key = FACES * index
     if shape.kind == MESH:
         key += MESH_KEY

@@ -1,8 +1,8 @@
 """Rays through the scene: the closest hit and any hit among objects and proxies.
 
-Functions that walk the scene come from ``make_trace``, specialised to the kinds of shape that are there: a scene of
-spheres holds no mesh code. ``kernels/rays/shapes.py`` has the shapes one by one; here rays also leave surfaces
-(``offset_origin``) and meet mirror balls (``meets_probe``).
+``make_trace`` makes functions that intersect rays with the scene, specialised to its kinds of shape: code for a scene
+of spheres contains no meshes. ``kernels/rays/shapes.py`` intersects single shapes. ``offset_origin`` moves the origin
+of a ray off its surface, ``meets_probe`` tests mirror balls.
 
 References:
     [WB19] Waechter, Binder, "A Fast and Robust Method for Avoiding Self-Intersection", Ray Tracing Gems ch. 6, 2019.
@@ -48,7 +48,7 @@ ALL_KINDS = tuple(sorted(map(int, (SPHERE, BOX, PLANE, MESH))))
 
 @wp.func
 def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-    """Return whether a mirror ball lies in the way."""
+    """Return whether a ray meets a mirror ball before ``t_max``."""
     for index in range(probes.shape[0]):
         probe = probes[index]
         if intersect_sphere(probe.radius, origin - probe.center, direction, t_max) < t_max:
@@ -58,12 +58,12 @@ def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_
 
 @wp.func
 def offset_origin(point: wp.vec3, geometric_normal: wp.vec3, direction: wp.vec3, error: wp.float32) -> wp.vec3:
-    """Origin of a ray that leaves a surface: moved off it along the normal, to the side that ``direction`` goes to.
+    """Return the origin of a ray that leaves a surface: moved along the normal, to the side of ``direction``.
 
-    A ray along the normal by ``Hit.error`` cannot meet the surface it leaves, at any scale and distance from the
-    world's origin. [WB19] count units in the last place of the point alone, and so need a fixed distance near the
-    origin, where those vanish but the error of a point that was computed relative to its shape does not; ``Hit.error``
-    knows the shape.
+    An offset of ``Hit.error`` keeps the ray from meeting the surface that it leaves, at any scale and distance from the
+    world's origin. [WB19] use units in the last place of the point alone. These vanish near the world's origin, where
+    the error of a point computed relative to its shape does not, so [WB19] need a fixed distance there. ``Hit.error``
+    includes the shape's size.
     """
     return point + wp.where(wp.dot(geometric_normal, direction) < 0.0, -error, error) * geometric_normal
 
@@ -97,20 +97,20 @@ class TraceConfig:
     """True if any object may be stretched."""
 
     def general(self) -> TraceConfig:
-        """For any scene with such triangles: each shape's kind is asked for as it is met."""
+        """Return a configuration for all kinds of shape, with the same detail; kinds are tested at run time."""
         return TraceConfig(ALL_KINDS, ALL_KINDS, self.detail, self.stretched)
 
 
 @functools.cache
 def _ways(stretched: bool) -> tuple[wp.Function, wp.Function, wp.Function]:
-    """Into a shape's coordinates, points and vectors, and normals out of them."""
+    """Return functions that map points and vectors into a shape's coordinates, and normals out of them."""
     if stretched:
         return to_local_point, to_local_vector, to_world_normal
     return to_rigid_point, to_rigid_vector, to_rigid_normal
 
 
 def _label(kinds: tuple[int, ...], detail: bool, stretched: bool) -> str:
-    """Tells functions of several kinds of shape in one module apart."""
+    """Return a label that distinguishes functions for different kinds of shape in one module."""
     return "_".join(map(str, (*kinds, int(detail), int(stretched))))
 
 
@@ -119,7 +119,7 @@ def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.F
     """Closest hit among shapes of the given kinds."""
     local_point, local_vector, world_normal = _ways(stretched)
 
-    # One function, long as it is: what it is handed on a CPU is copied for every function that it calls.
+    # One long function: on a CPU arguments are copied for every function that is called.
     @wp.func(name=f"closest_hit_{_label(kinds, detail, stretched)}", module="unique")
     def closest_hit(
         scene: RayScene,
@@ -172,7 +172,7 @@ def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.F
                 p = local_point(shape, origin) + hit.t * local_vector(shape, direction)
                 geometric = wp.vec3(0.0, 0.0, 1.0)
                 normal = wp.vec3(0.0, 0.0, 1.0)
-                # Each kind puts the point back onto its surface: the error of t, large for a far origin, ends here.
+                # Each kind projects the point onto its surface, which removes the error of t, large for a far origin.
                 if wp.static(SPHERE in kinds):
                     if shape.kind == SPHERE:
                         geometric = wp.normalize(p)
