@@ -63,11 +63,11 @@ class Watch:
         setattr(owner, name, timed)
 
     def _follow(self, crew: Crew) -> None:
-        run: Callable[[], Any] = crew.run
+        run: Callable[..., Any] = crew.run
 
-        def followed() -> Any:
+        def followed(*due: Any) -> Any:
             begin = time.perf_counter()
-            times = run()
+            times = run(*due)
             self.parts["native"].append((time.perf_counter() - begin) * 1e3)
             for name, nanoseconds in times.items():
                 self.stages[name].append(nanoseconds * 1e-6)

@@ -17,7 +17,6 @@ EXAMPLES = ROOT / "docs" / "examples"
 
 METHOD = """
 import numpy as np, warp as wp
-from warp_ar.stages.shared.settled import settled_environment
 from warp_ar import Pipeline, Quality, load_scene
 from warp_ar.stages.quality import PRESETS
 quality = PRESETS["low"].with_methods(irradiance="mean")
@@ -25,7 +24,7 @@ with Pipeline(load_scene("torus"), device="cpu", quality=quality) as pipeline:
     stage = next(stage for stage, _ in pipeline.plan.stages if stage.name == "irradiance")
     assert "mean" in stage.methods
     arrays = pipeline.arrays
-    settled_environment(arrays, pipeline.device).fill_(wp.vec3(0.5, 1.0, 2.0))
+    arrays["environment"].fill_(wp.vec3(0.5, 1.0, 2.0))
     step = next(own for own in pipeline.scheduler._stages if own[0].name == "irradiance")
     for one in step[1]:
         one.launch(None)

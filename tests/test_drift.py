@@ -9,7 +9,7 @@ import warp as wp
 
 from tests.simulated_camera import decode_srgb
 from warp_ar import Pipeline
-from warp_ar.kernels.environment.change import scale_radiance
+from warp_ar.kernels.environment.accumulate import scale_radiance
 from warp_ar.scene import Pose, Scene, loads_scene
 from warp_ar.sources.deep_frame import Plate
 from warp_ar.tracking.drift import CONTRASTS, ExposureDrift

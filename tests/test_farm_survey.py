@@ -13,7 +13,6 @@ from warp_ar.farm import survey
 from warp_ar.farm.jobs import Context, Job, scene_of
 from warp_ar.farm.survey import Survey
 from warp_ar.farm.work import Work
-from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.output.sinks import open_sink
 from warp_ar.sources.sources import open_source
 
@@ -63,7 +62,9 @@ def one_after_another(jobs):
             light = np.array(pipeline.arrays["environment"].numpy())
             emitters = pipeline.arrays["emitters"].numpy().tobytes()
             if keys:
-                moved = np.abs(light - lights[-1][0]) > CHANGE_FLOOR + CHANGE_SHARE * np.abs(lights[-1][0])
+                moved = np.abs(light - lights[-1][0]) > survey.CHANGE_FLOOR + survey.CHANGE_SHARE * np.abs(
+                    lights[-1][0]
+                )
                 if emitters == lights[-1][1] and not moved.any():
                     continue
             keys.append(frame.index)

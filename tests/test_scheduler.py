@@ -53,9 +53,6 @@ class AddOne(Stage):
 
         return [Pass(launch, rows=SIZE)]
 
-    def changed(self, name: str) -> bool:
-        return not self.request.scene.still
-
 
 def chain(*names: str) -> tuple[type[Stage], ...]:
     """Stages frame -> names[0] -> names[1] -> ..."""
@@ -71,7 +68,7 @@ def plan_of(
 ) -> Plan:
     monkeypatch.setattr(graph, "STAGES", stages)
     monkeypatch.setattr(graph, "find_features", lambda request: types.SimpleNamespace(request=request))
-    values = types.SimpleNamespace(**{"unwanted": (), "still": False, **scene})
+    values = types.SimpleNamespace(**{"unwanted": (), **scene})
     return make_plan(Request(values, PRESETS["medium"], (4, 4), outputs))  # type: ignore[arg-type]
 
 
@@ -118,15 +115,6 @@ def test_unchanged_input_skips(monkeypatch: pytest.MonkeyPatch, device: str) -> 
     np.testing.assert_array_equal(arrays["b"].numpy(), 7)
     scheduler.forget()
     assert run_count(scheduler.run()) == 2
-    scheduler.close()
-
-
-def test_a_stage_that_reports_no_change_spares_its_readers(monkeypatch: pytest.MonkeyPatch) -> None:
-    arrays = inputs("cpu")
-    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",), still=True), arrays, wp.get_device("cpu"))
-    assert run_count(scheduler.run()) == 2, "the first run must reach every stage"
-    arrays.touch("frame")
-    assert run_count(scheduler.run()) == 1
     scheduler.close()
 
 

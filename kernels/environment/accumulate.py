@@ -22,6 +22,8 @@ not fall because the exposure rises. Without a drift m does not lie above a clip
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import warp as wp
 
 from warp_ar.kernels.color import brightness
@@ -193,3 +195,25 @@ Args:
     params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
     environment_out: (h, w) accumulated light.
 """
+
+
+@wp.kernel(enable_backward=False)
+def scale_radiance_kernel(
+    # In:
+    factor: wp.vec3,
+    # Out:
+    radiance_out: wp.array2d[wp.vec3],
+):
+    """Scale one texel."""
+    i, j = wp.tid()
+    radiance_out[i, j] = wp.cw_mul(radiance_out[i, j], factor)
+
+
+def scale_radiance(radiance_out: wp.array, factor: Sequence[float]) -> None:
+    """Multiply a map by a colour.
+
+    Args:
+        radiance_out: ``wp.vec3`` (h, w).
+        factor: RGB.
+    """
+    wp.launch(scale_radiance_kernel, radiance_out.shape, [wp.vec3(*factor)], [radiance_out], device=radiance_out.device)

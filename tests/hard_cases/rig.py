@@ -43,7 +43,6 @@ from warp_ar.stages.features import Features, find_features
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.request import LAYERS, Request
-from warp_ar.stages.shared.settled import PUBLISHED
 from warp_ar.tracking.tracking import Track, TrackState
 
 SIZE = (48, 36)
@@ -290,10 +289,6 @@ class Rig:
             values = np.full((*array.shape, *_lanes(array)), values, np.float32)
         array.assign(np.ascontiguousarray(values))
         self.arrays.touch(name)
-        if name == "environment":
-            for copy in PUBLISHED:  # what filters read of it
-                if copy in self.arrays:
-                    self.arrays[copy].assign(array)
 
     def get(self, name: str) -> np.ndarray:
         """A copy of an array's contents."""

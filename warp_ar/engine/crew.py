@@ -1,8 +1,7 @@
 """Native threads that run a frame's passes on CPU, their tables, and calls back into Python.
 
 ``kernels/bands.py`` describes the threads' algorithm. This module packs all launches into its tables once; for each
-frame it enters the rows of the passes to run. Steps that need Python are called back: work on the host, and the
-decision whether to run a stage if it depends on the result of an earlier stage.
+frame it enters the rows of the passes to run. Steps that need Python, such as work on the host, are called back.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ import warp as wp
 
 from warp_ar.kernels import bands
 from warp_ar.kernels.launch import Note, alone_with_tiles
-from warp_ar.stages.base import Pass, Rows, Stage
+from warp_ar.stages.base import Pass, Stage
 
 _Entry = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 _Callback = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
@@ -99,8 +98,6 @@ class Crew:
         *,
         threads: int,
         bands_per_pass: int | None,
-        decide: Callable[[Stage], object],
-        finish: Callable[[Stage], None],
     ) -> None:
         """Pack all passes; the threads start with the first frame.
 
@@ -110,14 +107,10 @@ class Crew:
             readers: Names of the stages that read the output of each stage.
             threads: Number of threads that process rows, including the caller's.
             bands_per_pass: Number of equal bands of each pass; None: chosen by the rows and threads.
-            decide: Called when the inputs of a stage marked by ``ask`` are ready; it calls ``begin`` if the stage is to
-                run.
-            finish: Called at the end of a stage that was begun with ``tell``.
 
         Raises:
             ValueError: There are more stages than the native tables hold.
         """
-        self._decide, self._finish = decide, finish
         self._error: BaseException | None = None
         self._system = _System()
         self._packed: list[Any] = []
@@ -127,7 +120,6 @@ class Crew:
         self._names = [stage.name for stage, _ in steps]
         if len(steps) > bands.MOST_STAGES:
             raise ValueError(f"{len(steps)} stages; native threads run at most {bands.MOST_STAGES}")
-        self._places = {name: place for place, name in enumerate(self._names)}
         self._rows: dict[int, int] = {}  # of the pass table, by the pass's id
         self._tiles = False
         self._fill_tables(steps, notes, readers)
@@ -144,13 +136,14 @@ class Crew:
         stages: list[dict[str, int]] = []
         reading: list[int] = []
 
+        places = {name: place for place, name in enumerate(self._names)}
+
         def add_host(step: Callable[[], None]) -> None:
             passes.append({"whole": 1, "callback": len(self._host_steps)})
             self._host_steps.append(step)
 
         for stage, own in steps:
             first = len(passes)
-            add_host(lambda stage=stage: self._decide(stage))  # type: ignore[misc,arg-type]
             for step in own:
                 self._rows[id(step)] = len(passes)
                 packed = self._pack(step, notes[id(step)]) if id(step) in notes else None
@@ -162,8 +155,7 @@ class Crew:
                 span = {"first_call": len(calls), "last_call": len(calls) + len(packed)}
                 passes.append({**span, "whole": int(tiles or step.rows is None), "tiles": int(tiles), "callback": -1})
                 calls += packed
-            add_host(lambda stage=stage: self._finish(stage))  # type: ignore[misc]
-            told = [self._places[name] for name in readers[stage.name]]
+            told = [places[name] for name in readers[stage.name]]
             stages.append(
                 {
                     "first_pass": first,
@@ -177,11 +169,11 @@ class Crew:
         self._calls = _table(bands.CALL, calls)
         self._stages = _table(bands.STAGE, stages)
         self._readers = np.array(reading or [0], np.int64)
-        self._waits = np.bincount(reading, minlength=len(stages)).astype(np.int64)
-        self._first = _column(self._stages, bands.STAGE, "first_pass").copy()
-        self._last = _column(self._stages, bands.STAGE, "last_pass").copy()
+        waits = np.bincount(reading, minlength=len(stages)).astype(np.int64)
+        begin, end = (_column(self._stages, bands.STAGE, name) for name in ("first_pass", "last_pass"))
+        self._owner = np.repeat(np.arange(len(stages)), end - begin)
         self._unbegun = self._stages.copy()
-        for name, column in (("waits", self._waits), ("current", self._first), ("ready", 2 * (self._waits == 0))):
+        for name, column in (("waits", waits), ("current", begin), ("ready", 2 * (waits == 0))):
             _column(self._unbegun, bands.STAGE, name)[:] = column
         self._open, self._has_failed = bands.STATE.index("open"), bands.STATE.index("failed")
         self._start, self._stop, self._time = (
@@ -277,35 +269,22 @@ class Crew:
 
     # ---- one frame ------------------------------------------------------------------------------------------------
 
-    def reset(self) -> None:
-        """Start the description of a frame: no pass runs."""
-        self._start[:] = 0
-        self._stop[:] = 0
-        self._time[:] = 0
-
-    def ask(self, stage: Stage) -> None:
-        """Have ``decide`` called for a stage when its inputs are ready."""
-        self._stop[self._first[self._places[stage.name]]] = 1
-
-    def begin(self, stage: Stage, due: Sequence[tuple[Pass, Rows]], *, tell: bool) -> None:
-        """Enter the rows of the passes that a stage runs in this frame.
+    def run(self, due: Sequence[tuple[Stage, list[Pass]]]) -> Mapping[str, float]:
+        """Run a frame, with this thread as one of the threads; return nanoseconds of all threads by stage.
 
         Args:
-            stage: Stage to run.
-            due: Passes to run, each with its rows; (0, 1) for a pass without rows.
-            tell: Whether ``finish`` is called at the stage's end.
-        """
-        for step, (start, stop) in due:
-            row = self._rows[id(step)]
-            self._start[row], self._stop[row] = start, max(start, stop)
-        self._stop[self._last[self._places[stage.name]] - 1] = int(tell)
-
-    def run(self) -> Mapping[str, float]:
-        """Run the frame, with this thread as one of the threads; return nanoseconds of all threads by stage.
+            due: Stages to run, with their passes that take part.
 
         Raises:
             BaseException: First error of a step in Python; work in progress has ended.
         """
+        for column in (self._start, self._stop, self._time):
+            column[:] = 0
+        for step in (step for _, steps in due for step in steps):
+            all_rows = 0, 1 if step.rows is None else step.rows
+            start, stop = all_rows if step.extent is None else step.extent()
+            row = self._rows[id(step)]
+            self._start[row], self._stop[row] = start, max(start, stop)
         self._stages[:] = self._unbegun
         self._state[0, self._open] = len(self._names)
         self._state[0, self._has_failed] = 0
@@ -325,7 +304,7 @@ class Crew:
         if self._error is not None:
             error, self._error = self._error, None
             raise error
-        times = np.add.reduceat(self._time, self._first)
+        times = np.bincount(self._owner, self._time, len(self._names))
         return dict(zip(self._names, times.tolist(), strict=True))
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels.environment.change import scale_radiance
+from warp_ar.kernels.environment.accumulate import scale_radiance
 from warp_ar.kernels.structs import struct_values
 from warp_ar.stages.base import Arrays
 

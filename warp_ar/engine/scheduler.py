@@ -45,9 +45,6 @@ class StageTiming:
     """Reason that the stage could change no pixel of this frame; None if it could."""
 
 
-SKIPPED = StageTiming(0.0, True)
-
-
 class Scheduler:
     """Runs the stages of one plan on one device."""
 
@@ -82,14 +79,13 @@ class Scheduler:
         if bands is not None and bands > 1:
             self._threads = max(self._threads, 2)  # so that bands run concurrently on one core, too
         self._crew: Crew | None = None
-        self._ran: set[str] = set()
         self._prepared = False
         self._stages: list[Step] = []
         self._first_launches: list[Note] = []
         self._fills: dict[str, Any] = {}
         self._seen: dict[str, Any] = {}
         self._translated: set[int] = set()
-        self._patterns: dict[Any, list[Segment]] = {}
+        self._patterns: dict[tuple[int, ...], list[Segment]] = {}
         self._graphs: dict[tuple[int, ...], Any] = {}
         self._stream: Any = None if self._on_cpu else wp.get_stream(device)
         self._streams: list[Any] = []
@@ -99,17 +95,6 @@ class Scheduler:
         self._build(spare or {})
         self._culling = culling
         self._demand = Demand([stage for stage, _ in self._stages], plan.request.resources)
-        self._unneeded: Mapping[str, str] = {}
-        """Reasons of the stages that can change no pixel of this frame."""
-        self._passes = {stage.name: passes for stage, passes in self._stages}
-        self._readers = _find_readers([stage for stage, _ in self._stages])
-        # Stages that choose their passes per frame: their passes are part of the frame's pattern.
-        self._late = {stage.name for stage, _ in self._stages if type(stage).changed is not Stage.changed}
-        """Stages that may report unchanged output after a run, so that their readers rest."""
-        self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
-        self._beginning = {stage.name for stage, _ in self._stages if type(stage).begin is not Stage.begin}
-        self._versions = {stage.name: arrays.versions_of(stage.wiring.reads) for stage, _ in self._stages}
-        self._left_out: dict[str, StageTiming] = {}
 
     def _build(self, spare: Mapping[str, Any]) -> None:
         """Allocate the arrays of the plan's stages and build their passes."""
@@ -231,15 +216,8 @@ class Scheduler:
                 note.do()
             self._first_launches.clear()
             if own:
-                self._crew = Crew(
-                    self._stages,
-                    notes,
-                    self._readers,
-                    threads=self._threads,
-                    bands_per_pass=self.bands,
-                    decide=self._enter,
-                    finish=self._publish,
-                )
+                readers = _find_readers([stage for stage, _ in self._stages])
+                self._crew = Crew(self._stages, notes, readers, threads=self._threads, bands_per_pass=self.bands)
         self._prepared = True
 
     def warm_up(self, progress: Progress | None = None) -> None:
@@ -273,124 +251,68 @@ class Scheduler:
         """Run the stages that this frame needs and whose inputs have changed; return the time of each.
 
         Args:
-            receive: Called on CUDA when the stages to run are known, before anything is launched.
+            receive: Called when the stages to run are known, before anything is launched.
         """
         self.prepare()
-        self._look()
-        if not self._on_cpu:
-            return self._run_captured(receive)
-        if self._crew is None or sys.gettrace() is not None:
-            return self._run_eager()  # under a debugger launchers are called, so that it stops at their breakpoints
-        return self._run_side_by_side(self._crew)
-
-    def _look(self) -> None:
-        """Find the stages that this frame does not need, and let them rest."""
-        reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
-        before, (self._unneeded, clearing) = self._unneeded, self._demand.look(reach)
-        if self._unneeded is not before:
-            reasons = self._unneeded if self._culling else {}
-            self._left_out = {name: StageTiming(0.0, True, reason) for name, reason in reasons.items()}
-        if self._unneeded:
-            for stage, _ in self._stages:
-                if stage.name in self._unneeded:
-                    stage.rest()
-        for name in clearing:
-            self._seen.pop(name, None)
-
-    def _timing_of_skipped(self, stage: Stage) -> StageTiming:
-        return self._left_out.get(stage.name, SKIPPED)
-
-    def _due(self, stage: Stage) -> Any:
-        """Return the versions of the stage's inputs; None if they are unchanged or the stage is not needed."""
-        name = stage.name
-        if self._culling and name in self._unneeded:
-            return None
-        versions = self._versions[name]()
-        return None if self._seen.get(name) == versions else versions
-
-    def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
-        """Return the passes of a stage that take part in this frame."""
-        if stage.name in self._beginning and stage.name not in self._unneeded:
-            stage.begin()
-        if stage.name not in self._changing:
-            return passes
-        return [step for step in passes if step.enabled is None or step.enabled()]
-
-    def _publish(self, stage: Stage) -> None:
-        if stage.name not in self._late:
-            self.arrays.touch_all(stage.wiring.writes)
-            return
-        if stage.name in self._unneeded:
-            return  # whether readers may rest is decided only in frames that have readers, with or without culling
-        for name in stage.wiring.writes:
-            if stage.changed(name) or self.arrays.version(name) == 0:
-                self.arrays.touch(name)
-
-    def _run_eager(self) -> dict[str, StageTiming]:
-        """Run one stage after another on this thread, on CPU."""
-        timings: dict[str, StageTiming] = {}
-        for stage, passes in self._stages:
-            versions = self._due(stage)
-            if versions is None:
-                timings[stage.name] = self._timing_of_skipped(stage)
-                continue
-            start = self.clock()
-            for step in self._begin(stage, passes):
-                self._launch(step, None if step.extent is None else step.extent())
-            self._seen[stage.name] = versions
-            self._publish(stage)
-            timings[stage.name] = StageTiming((self.clock() - start) * 1e3, False)
-        return timings
-
-    def _run_side_by_side(self, crew: Crew) -> dict[str, StageTiming]:
-        """Run stages on native threads by bands of rows; decide beforehand which stages run, where that is known.
-
-        For readers of a stage that reports only at its end whether its output changed, it is decided later.
-        """
-        start = self.clock()
-        crew.reset()
-        self._ran.clear()
-        open_ended: set[str] = set()
-        for stage, _ in self._stages:
-            if stage.name in open_ended:
-                crew.ask(stage)
-                open_ended.update(self._readers[stage.name])
-            elif self._enter(stage) and stage.name in self._late:
-                open_ended.update(self._readers[stage.name])
+        due, timings = self._choose()
+        if receive is not None:
+            receive()
         try:
-            times = crew.run()
+            if not due:
+                times: Mapping[str, float] = {}
+            elif not self._on_cpu:
+                times = self._run_captured(due)
+            elif self._crew is None or sys.gettrace() is not None:
+                times = self._run_eager(due)  # under a debugger, so that it stops at breakpoints in launchers
+            else:
+                times = self._run_side_by_side(due)
         except BaseException:
             self.forget()  # part of the work may not have been done
             raise
+        return timings | {name: StageTiming(milliseconds, False) for name, milliseconds in times.items()}
+
+    def _choose(self) -> tuple[list[Step], dict[str, StageTiming]]:
+        """Return the stages that run in this frame, with their passes, and the timings of the stages that do not."""
+        reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
+        unneeded, clearing = self._demand.look(reach)
+        for name in clearing:
+            self._seen.pop(name, None)
+        due: list[Step] = []
+        skipped: dict[str, StageTiming] = {}
+        for stage, passes in self._stages:
+            reason = unneeded.get(stage.name)
+            if reason is not None:
+                stage.rest()
+            left_out = reason if self._culling else None
+            versions = [self.arrays.version(name) for name in stage.wiring.reads]
+            if left_out is not None or self._seen.get(stage.name) == versions:
+                skipped[stage.name] = StageTiming(0.0, True, left_out)
+                continue
+            if reason is None:
+                stage.begin()
+            due.append((stage, [step for step in passes if step.enabled is None or step.enabled()]))
+            self._seen[stage.name] = versions
+            self.arrays.touch_all(stage.wiring.writes)
+        return due, skipped
+
+    def _run_eager(self, due: list[Step]) -> dict[str, float]:
+        """Run one stage after another on this thread; return milliseconds by stage."""
+        times: dict[str, float] = {}
+        for stage, passes in due:
+            start = self.clock()
+            for step in passes:
+                self._launch(step, None if step.extent is None else step.extent())
+            times[stage.name] = (self.clock() - start) * 1e3
+        return times
+
+    def _run_side_by_side(self, due: list[Step]) -> dict[str, float]:
+        """Run stages on native threads by bands of rows; return milliseconds by stage."""
+        assert self._crew is not None
+        start = self.clock()
+        times = self._crew.run(due)
         whole = (self.clock() - start) * 1e3
         busy = sum(times.values()) or 1.0
-        timings: dict[str, StageTiming] = {}
-        for stage, _ in self._stages:
-            spent = times[stage.name]
-            ran = stage.name in self._ran
-            timings[stage.name] = StageTiming(whole * spent / busy, False) if ran else self._timing_of_skipped(stage)
-        return timings
-
-    def _enter(self, stage: Stage) -> bool:
-        """Enter a stage's passes and rows in the crew's tables; return False if the stage does not run."""
-        versions = self._due(stage)
-        if versions is None:
-            return False
-        assert self._crew is not None
-        late = stage.name in self._late
-        due = [(step, self._rows_of(step)) for step in self._begin(stage, self._passes[stage.name])]
-        self._crew.begin(stage, due, tell=late)
-        self._seen[stage.name] = versions
-        self._ran.add(stage.name)
-        if not late:
-            self._publish(stage)
-        return True
-
-    def _rows_of(self, step: Pass) -> Rows:
-        """Return the rows of a pass in this frame; (0, 1) if it has no rows."""
-        if step.rows is None:
-            return (0, 1)
-        return step.extent() if step.extent is not None else (0, step.rows)
+        return {stage.name: whole * times[stage.name] / busy for stage, _ in due}
 
     def _launch(self, step: Pass, rows: Rows | None) -> None:
         if step.on_host or id(step) in self._translated:
@@ -400,33 +322,11 @@ class Scheduler:
             step.launch(rows)
         self._translated.add(id(step))
 
-    def _run_captured(self, receive: Callable[[], None] | None) -> dict[str, StageTiming]:
-        due: list[Step] = []
-        pattern: list[Any] = []
-        timings: dict[str, StageTiming] = {}
-        changing, seen = self._changing, self._seen
-        for whole in self._stages:
-            stage, passes = whole
-            versions = self._due(stage)
-            if versions is None:
-                timings[stage.name] = self._timing_of_skipped(stage)
-                continue
-            chosen = self._begin(stage, passes)
-            if stage.name in changing:
-                due.append((stage, chosen))
-                pattern.append((stage.name, *map(id, chosen)))
-            else:
-                due.append(whole)
-                pattern.append(stage.name)
-            seen[stage.name] = versions
-            self._publish(stage)
-        key = tuple(pattern)
+    def _run_captured(self, due: list[Step]) -> dict[str, float]:
+        """Replay the graphs of these passes, captured where they are new; return milliseconds by stage."""
+        key = tuple(id(step) for _, steps in due for step in steps)
         if key not in self._patterns:
             self._patterns[key] = _segments(due)
-        if receive is not None:
-            receive()
-        if not due:
-            return timings
         start = self.clock()
         for segment in self._patterns[key]:
             if segment.on_host:
@@ -437,14 +337,13 @@ class Scheduler:
                 self._replay(segment)
         names = [stage.name for stage, _ in due]
         if self._marks is None:
-            share = StageTiming((self.clock() - start) * 1e3 / len(due), False)
-            return timings | dict.fromkeys(names, share)
+            return dict.fromkeys(names, (self.clock() - start) * 1e3 / len(due))
         times = dict.fromkeys(names, 0.0)
         for segment in self._patterns[key]:
             for stage, steps in segment.part:
                 if not segment.on_host:
                     times[stage.name] += wp.get_event_elapsed_time(*self._marks[_ids(steps)])
-        return timings | {name: StageTiming(milliseconds, False) for name, milliseconds in times.items()}
+        return times
 
     def _replay(self, segment: Segment) -> None:
         graph = self._graphs.get(segment.key)

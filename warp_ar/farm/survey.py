@@ -16,7 +16,7 @@ stream of a map, float32 (h, 2 h, 3), followed by its emitters if the quality fi
 ``numpy.save``.
 
 A key is written when a texel of the environment has changed by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE
-* value``) since the last key. Stages that read the environment use the same tolerance.
+* value``) since the last key.
 
 Poses and light of a frame depend on the frames before it, so a clip is surveyed in order. While the marker of a frame
 is searched for, kernels process the light of the previous one, and a thread compares and compresses that of earlier
@@ -45,7 +45,6 @@ from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
 from warp_ar.farm.jobs import JobFile, inputs_of, jobs_of_clip, lit_range, scene_of, source_of
 from warp_ar.farm.manifest import describe_inputs
-from warp_ar.kernels.environment.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.kernels.structs import Emitter, struct_dtype
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
@@ -63,6 +62,10 @@ LIGHT = "light.exr"
 """File of the environment at the clip's end, with its emitters."""
 WAITING = 4
 """Largest number of frames whose light waits to be compared with the last key."""
+CHANGE_FLOOR = 0.0005
+CHANGE_SHARE = 0.01
+"""Relative change of a texel from which on a new map is written, about one 8-bit step. Until then, any normalised
+filter F of the map with weights that are not negative is off by at most ``CHANGE_FLOOR + CHANGE_SHARE * F``."""
 _MANTISSA = 12
 """Mantissa bits of stored radiance: the relative error of 2^-13 is a hundredth of a key's tolerance. Further bits are
 noise that does not compress."""

@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import functools
-import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 from warp_ar.stages.features import Features
@@ -168,10 +166,6 @@ class Arrays(dict[str, Any]):
         """Return the version of ``name``; 0 until it is first written."""
         return self._versions[name]
 
-    def versions_of(self, names: Sequence[str]) -> Callable[[], Any]:
-        """Return a function that returns the versions of several resources as a value to compare in every frame."""
-        return functools.partial(operator.itemgetter(*names), self._versions) if names else tuple
-
 
 NO_BALL = "the scene has no mirror ball, so the environment is unknown"
 NO_OBJECT = "the scene has no virtual object"
@@ -275,10 +269,6 @@ class Stage(abc.ABC):
 
     def close(self) -> None:  # noqa: B027
         """Release resources other than arrays, such as threads."""
-
-    def changed(self, name: str) -> bool:
-        """Return True if the last run changed the output ``name`` enough for its readers to run again."""
-        return True
 
     def resume(self, other: Stage) -> None:  # noqa: B027  (most stages remember nothing on the host)
         """Take over the host state of the same stage in another pipeline; its arrays have been copied."""

@@ -18,7 +18,6 @@ from warp_ar.stages.shared.environment_sets import (
     sample_names,
     sample_slots,
 )
-from warp_ar.stages.shared.settled import settled_environment
 
 
 class EnvironmentSamples(Stage):
@@ -74,7 +73,7 @@ class EnvironmentSamples(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Return passes that sum and invert, and for the reference list the texels of a small map; ball after ball."""
         emitters = arrays["emitters"] if self.features.emitters else None
-        passes = self._draw(arrays, 0, settled_environment(arrays, device), emitters)
+        passes = self._draw(arrays, 0, arrays["environment"], emitters)
         for ball in range(self.features.others):
             emitters = arrays["others_emitters"][ball] if self.features.emitters else None
             passes += self._draw(arrays, ball + 1, arrays["others_environment"][ball], emitters)

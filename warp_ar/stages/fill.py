@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.environment import change, fill, fill_frame
+from warp_ar.kernels.environment import fill, fill_frame
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows, unobserved
 from warp_ar.stages.features import Features
@@ -47,23 +47,19 @@ class Fill(Stage):
         return Wiring(reads, (written, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the map, the fill pyramid, and the map as its readers last saw it."""
+        """Return the map and the fill pyramid."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         return {
             **{name: ArraySpec((self.features.others, *shape), wp.vec3) for name in self.wiring.writes[1:]},
             self.wiring.writes[0]: ArraySpec(shape, wp.vec3),
             "fill_levels": ArraySpec((fill.fill_level_offsets(*shape)[-1],), wp.vec4),
-            "fill_published": ArraySpec(shape, wp.vec3),
-            "fill_difference": ArraySpec((height,), wp.float32),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return passes down and up the pyramid and, on CPU, one that measures the change since readers last ran."""
+        """Return passes down and up the pyramid."""
         self._arrays = arrays
-        self._on_cpu = device.is_cpu
         self._is_filled = self._holds = False
-        height = self.request.quality.environment_height
         # One exposure gives no larger values. With merged exposures the limit keeps lamps from being spread into unseen
         # directions.
         most = math.inf
@@ -76,9 +72,6 @@ class Fill(Stage):
             maps.append(tuple(arrays[name][ball] for name in names))
         proxies = trace_variant(trace_config(self.request.scene), device).proxies
         passes = [one for ball, known in enumerate(maps) for one in self._complete(arrays, ball, known, most, proxies)]
-        if self._on_cpu:
-            seen = (arrays[name] for name in (self.wiring.writes[0], "fill_published", "fill_difference"))
-            passes.append(over_rows(height, change.measure_difference, *seen))
         return [dataclasses.replace(one, enabled=lambda: not self._holds) for one in passes]
 
     @staticmethod
@@ -101,15 +94,3 @@ class Fill(Stage):
         """Keep the last map if something covers a ball, because it also covers the frame's view behind the ball."""
         self._holds = self._is_filled and self._arrays["ball_covered"]()
         self._is_filled = True
-
-    def changed(self, name: str) -> bool:
-        """Return True if some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
-
-        On CUDA it is always True, because the host would have to wait for the device; likewise for further balls.
-        """
-        if not self._on_cpu or name != self.wiring.writes[0]:
-            return True
-        if not self._arrays["fill_difference"].numpy().max() > 1.0:
-            return False
-        wp.copy(self._arrays["fill_published"], self._arrays[self.wiring.writes[0]])
-        return True

@@ -11,7 +11,6 @@ import warp as wp
 from warp_ar.kernels.environment import irradiance, sphere_map
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.settled import settled_environment
 
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
 CLUSTERS = (10, 20)
@@ -92,7 +91,7 @@ class Irradiance(Stage):
             return [
                 Pass(lambda rows: sphere_map.look_up_level(*known, out, scale=math.pi, rows=rows), rows=MAP_SIZE[0])
             ]
-        passes = self._filter(arrays, settled_environment(arrays, device), arrays[self.features.irradiance])
+        passes = self._filter(arrays, arrays["environment"], arrays[self.features.irradiance])
         for ball in range(self.features.others_with_irradiance):
             passes += self._filter(arrays, arrays["others_environment"][ball], arrays["others_irradiance"][ball])
         return passes

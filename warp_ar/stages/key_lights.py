@@ -11,7 +11,6 @@ from warp_ar.kernels.environment import key_lights
 from warp_ar.kernels.structs import KeyLight
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.settled import settled_environment
 
 
 class KeyLights(Stage):
@@ -45,5 +44,5 @@ class KeyLights(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Return two launches: with one row per thread, and with one thread."""
-        known = settled_environment(arrays, device), arrays["key_lights_sums"], arrays["key_lights"]
+        known = arrays["environment"], arrays["key_lights_sums"], arrays["key_lights"]
         return [Pass(lambda rows: key_lights.find_key_light(*known))]

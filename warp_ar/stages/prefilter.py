@@ -23,7 +23,6 @@ from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.settled import settled_environment
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
@@ -108,7 +107,7 @@ class Prefilter(Stage):
         """Return the launches of the method; weights and samples are computed here, once."""
         if self.method == "sphere_mip":
             return self._look_up(arrays)
-        passes = self._filter(arrays, settled_environment(arrays, device), arrays["prefilter_levels"])
+        passes = self._filter(arrays, arrays["environment"], arrays["prefilter_levels"])
         for ball in range(self._others(self.features)):
             passes += self._filter(arrays, arrays["others_environment"][ball], arrays["others_levels"][ball])
         return passes

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels.environment import change
 from warp_ar.kernels.launch import copy
 from warp_ar.kernels.recovery import recover as kernels
 from warp_ar.kernels.recovery import relocate
@@ -133,7 +132,7 @@ class Recover(Stage):
         return Wiring((*reads, "others_filled", *kept, "probe_places"), (*writes, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the map, the arrays of the equations, and the map as its readers last saw it."""
+        """Return the map and the arrays of the equations."""
         height, others = self.request.quality.environment_height, self.features.others
         shape, most = (height, 2 * height), (CONFIG.search.most,)
         cells = cell_shape(*shape)
@@ -159,8 +158,6 @@ class Recover(Stage):
             "recover_mirrored": ArraySpec((points, cells[0] * cells[1]), wp.float32),
             "recover_emitters": ArraySpec((MOST_EMITTERS,), wp.vec4),
             "recover_emitter_transfer": ArraySpec((points * MOST_EMITTERS,), wp.float32),
-            "recover_published": ArraySpec(shape, wp.vec3),
-            "recover_difference": ArraySpec((height,), wp.float32),
         }
         if self.features.emitters:
             specs["emitters"] = ArraySpec(most, Emitter)
@@ -178,7 +175,7 @@ class Recover(Stage):
         self._arrays, self._on_cpu = arrays, bool(device.is_cpu)
         arrays["recover_points"].assign(self._surfaces.points)
         self._progress = _Progress(self._new_solver())
-        self._asks = self._arrives = self._news = self._follows = False
+        self._asks = self._arrives = self._follows = False
         self._worker: ThreadPoolExecutor | None = None
         arrays.add("recover_status", self.status)
 
@@ -201,7 +198,7 @@ class Recover(Stage):
             Pass(self._note_card, enabled=lambda: self._asks),
             Pass(self._follow, enabled=lambda: self._follows),
         )
-        passes = [
+        return [
             Pass(self._take, on_host=True, enabled=lambda: self._arrives, beforehand=True),
             *self._equations(height, rows),
             *(looks[:2] if self._card else ()),
@@ -218,10 +215,6 @@ class Recover(Stage):
             ),
             *(one for ball in range(self.features.others) for one in self._relocate(ball)),
         ]
-        if self._on_cpu:
-            names = "environment", "recover_published", "recover_difference"
-            passes.append(Pass(self._launch(change.measure_difference, *names), rows=height))
-        return passes
 
     def _launch(self, launcher: Any, *names: str) -> Any:
         """Return a function of a band of rows that calls a launcher with named arrays."""
@@ -342,7 +335,7 @@ class Recover(Stage):
         now.frames += 1
         now.waited += 1
         rested, now.rested = now.rested, False
-        since, interval, self._news = abs(seconds - now.last) + 1e-3, EVERY_SECONDS, False
+        since, interval = abs(seconds - now.last) + 1e-3, EVERY_SECONDS
         self._arrives = now.pending is not None and since > LATENCY
         if self._real_time:
             self._arrives = self._arrives and now.pending is not None and now.pending.done()
@@ -359,7 +352,7 @@ class Recover(Stage):
 
     def rest(self) -> None:
         """Begin no estimate and apply none; the first frame that needs an estimate begins it at once."""
-        self._asks = self._arrives = self._follows = self._news = False
+        self._asks = self._arrives = self._follows = False
         self._progress.rested = True
 
     def _ask(self, rows: Rows | None) -> None:
@@ -452,7 +445,6 @@ class Recover(Stage):
             now.solver, now.failed = self._new_solver(), str(error)
             return
         now.solver, now.took, estimate = solved.solver, solved.seconds, solved.estimate
-        self._news = estimate is not None
         if estimate is None:
             return
         now.estimate = estimate
@@ -487,17 +479,6 @@ class Recover(Stage):
         mine, yours = self.request.scene, other.request.scene
         if (mine.marker, mine.probes, mine.proxies) == (yours.marker, yours.probes, yours.proxies):
             self._progress = dataclasses.replace(other._progress)
-
-    def changed(self, name: str) -> bool:
-        """Return as ``Fill.changed``; emitters change when an estimate takes effect."""
-        if name == "emitters":
-            return self._news
-        if name != "environment" or not self._on_cpu:
-            return True
-        if not self._arrays["recover_difference"].numpy().max() > 1.0:
-            return False
-        wp.copy(self._arrays["recover_published"], self._arrays["environment"])
-        return True
 
     def status(self) -> Mapping[str, Any]:
         """Return the evidence of the last estimate for reports, and the error of a later failed one (see ``_take``)."""

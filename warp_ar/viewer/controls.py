@@ -1,7 +1,7 @@
 """State shared by the page's threads: the source, the wanted scene, its edits, and their lock.
 
-A scene may name a capture device of this machine. If the device is absent, the page shows a notice until a viewer uses
-the camera of a browser. Pictures of a browser's camera are received here.
+A user's own scene names a capture device of this machine. If it is absent, the page says so until a browser's camera is
+used instead; its pictures are received here.
 """
 
 from __future__ import annotations
@@ -36,14 +36,11 @@ Image = npt.NDArray[np.uint8]
 MOST_EDITS: Final = 100
 """Edits that can be undone."""
 TOGETHER_SECONDS: Final = 1.0
-"""Longest time between two changes of one value that count as one edit (a dragged slider), seconds."""
+"""Seconds within which successive changes of one value count as one edit, such as dragging a slider."""
 
 
 class History:
-    """Undo history: edits in order, each with a label and the state before or after it.
-
-    Callers hold the lock of the ``Controls`` that own the history.
-    """
+    """Undo history: edits in order, each with a label and the state before or after it. The owner holds a lock."""
 
     def __init__(self) -> None:
         self.done: list[tuple[str, Wanted]] = []
@@ -51,12 +48,12 @@ class History:
         self._last = -TOGETHER_SECONDS
 
     def note(self, label: str, before: Wanted, now: float) -> None:
-        """Record an edit.
+        """Note an edit.
 
         Args:
-            label: Description of the edit. Successive edits with equal labels may be merged.
-            before: State before the edit.
-            now: Time on a monotonic clock, seconds.
+            label: Its words; successive edits with the same words may become one.
+            before: State before it.
+            now: Seconds on a clock that does not jump.
         """
         self.undone.clear()
         same = bool(self.done) and self.done[-1][0] == label and now - self._last < TOGETHER_SECONDS
@@ -65,27 +62,23 @@ class History:
             self.done = [*self.done, (label, before)][-MOST_EDITS:]
 
     def move(self, wanted: Wanted, *, back: bool) -> Wanted | None:
-        """Undo the last edit, or with ``back`` False redo the last undone edit.
-
-        Returns:
-            The new state; None if there is no such edit.
-        """
+        """Undo the last edit, or with ``back`` False redo the last undone one; return None without one."""
         source, target = (self.done, self.undone) if back else (self.undone, self.done)
         if not source:
             return None
         label, other = source.pop()
         target.append((label, wanted))
         self._last = -TOGETHER_SECONDS
-        # Quality is not part of the history, as a budget changes it too.
+        # The quality is no edit: a budget chooses it too.
         return dataclasses.replace(other, quality=wanted.quality)
 
     def drop(self, before: Wanted) -> None:
-        """Remove the last edit if ``before`` is the state before it, because its pipeline could not be built."""
+        """Forget the last edit if ``before`` is the state before it: it could not be made."""
         if self.done and dataclasses.replace(self.done[-1][1], quality=before.quality) == before:
             self.done.pop()
 
     def clear(self) -> None:
-        """Forget all edits."""
+        """Forget all."""
         self.done.clear()
         self.undone.clear()
 
@@ -94,24 +87,24 @@ REMEDY: Final = "press “My camera”, which opens the camera of the machine th
 
 
 class NoCamera(Source):
-    """Source that stands in for an absent camera: it repeats one grey picture while the page shows the remedy."""
+    """Source that repeats one grey picture, while pipelines are built and the page explains what to do."""
 
     live, length, fps = True, None, 2.0
 
     def __init__(self, size: tuple[int, int], error: SourceError) -> None:
-        """Create the source.
+        """Keep the fault.
 
         Args:
             size: (width, height) of the picture, pixels.
-            error: Error of the capture device, shown on the page.
+            error: Error of the capture device.
         """
         self.size, self.description, self.error = size, "no camera", error
         self.finding = Finding("source.absent", str(error).partition(";")[0], REMEDY)
-        """Error of the capture device and its remedy, as shown on the page."""
+        """Fault, and its remedy on the page."""
         self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the picture, twice a second, until the source is closed."""
+        """The picture, until the source is closed."""
         image, self.start = np.full((self.size[1], self.size[0], 3), 64, np.uint8), time.monotonic()
         for index in itertools.count():
             yield Frame(index, time.monotonic() - self.start, image)
@@ -128,7 +121,7 @@ CAMERA: Final = "camera"
 TRACED: Final = "traced"
 DIFFERENCE: Final = "difference"
 CONVERGING: Final = (TRACED, DIFFERENCE)
-"""Comparisons of a held frame: with the reference, or with the difference to the reference in false colours."""
+"""Comparisons of a held picture: with the reference, or with the difference to it in colours."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -137,11 +130,11 @@ class Feed:
 
     source: Source
     camera: Camera | None = None
-    """Camera that replaces the scene's; None keeps the scene's."""
+    """Another camera than the scene's."""
     wanted: Wanted | None = None
-    """State to show once this feed is in use; None keeps the present state."""
+    """State to show from then on."""
     owner: object = None
-    """Viewer whose camera is the source; None for other sources."""
+    """The viewer whose camera it is."""
     estimated: bool = False
     """True once the camera's focal length has been estimated from frames."""
 
@@ -152,15 +145,10 @@ class Feed:
 
 
 def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | None = None) -> Feed:
-    """Open the given source, or without one the scene's own; an absent capture device gives a ``NoCamera``.
-
-    Args:
-        scene: Scene of the frames.
-        given: Source to open instead of the scene's.
-        wanted: State of the new feed.
+    """Open a scene's own source, or the one that was given; of a capture device that is not there a ``NoCamera``.
 
     Raises:
-        WarpArError: The source cannot be opened, or no source is given and the scene names none.
+        WarpArError: It cannot be opened, or the scene names none.
     """
     try:
         return Feed(open_scene_source(scene, given, loop=True), wanted=wanted)
@@ -171,7 +159,7 @@ def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | Non
 
 
 def _is_device(source: str | int | Path | None) -> bool:
-    """Return True if the source is a plausible index of a capture device."""
+    """Return True for a capture device that there may be."""
     if isinstance(source, str) and source.isdecimal() and len(source) <= 4 and not Path(source).exists():
         source = int(source)
     return isinstance(source, int) and 0 <= source <= MOST_INDEX
@@ -180,22 +168,22 @@ def _is_device(source: str | int | Path | None) -> bool:
 class Controls:
     """State of the page: source, scene, comparison, playing or held.
 
-    Methods may be called from any thread. A caller that waits for a change must hold ``changed``.
+    Methods may be called from any thread; whoever waits holds ``changed``.
     """
 
     def __init__(self, feed: Feed, wanted: Wanted, notify: Notify) -> None:
         self._notify = notify
         self.changed = threading.Condition()
-        """Lock of this object's state, notified at every change."""
+        """Guards all of this; notified at every change."""
         self.wanted = wanted
-        """State that viewers see, at the latest once its pipeline is built."""
+        """State that viewers see now, or will once it is built."""
         self.compare = ""
-        """Picture to compare with: empty for none, ``CAMERA``, one of ``CONVERGING``, or a preset."""
+        """Second picture: nothing, ``CAMERA``, one of ``CONVERGING`` or a preset."""
         self.playing = True
         self.watchers = 0
-        """Number of viewers; frames are lit only while there is one."""
+        """Viewers; without any, no frame is lit."""
         self.edits = 0
-        """Counter of changes that need a new picture."""
+        """Grows with every change of what is shown."""
         self.stopped = False
         self.feed = feed
         self._next: Feed | None = None
@@ -203,23 +191,23 @@ class Controls:
 
     @property
     def newest_feed(self) -> Feed:
-        """Feed that was requested last. Frames may still come from the previous feed."""
+        """The feed that was asked for last; the frames may still come from the one before."""
         return self._next or self.feed
 
     @property
     def leaving(self) -> bool:
-        """True if frames of the present source shall end."""
+        """True if the present source shall be left."""
         return self.stopped or self._next is not None
 
     def wait(self, seconds: float | None = None) -> None:
-        """Wait until the present source shall be left, for at most so many seconds; None sets no limit."""
+        """Wait so long, or without an end, until the present source shall be left."""
         with self.changed:
             self.changed.wait_for(lambda: self.leaving, timeout=seconds)
 
     def _adopt(self, wanted: Wanted | None) -> None:
-        """Set the wanted state (None keeps it) and send it to the viewers.
+        """Want something else, or with None the same, and tell viewers; to be called with the lock held.
 
-        The caller holds the lock, so that the last message always describes the final state.
+        So the last that they hear is the state that is.
         """
         if wanted is not None:
             self.wanted = wanted
@@ -227,11 +215,11 @@ class Controls:
         self._notify(self.scene_message())
 
     def change(self, make: Callable[[Wanted], Wanted], label: str | None = None) -> None:
-        """Replace the wanted state by a function of it.
+        """Make the wanted state anew from the one before.
 
         Args:
-            make: Function from the present wanted state to the next.
-            label: Description of the edit; None records no edit, so that the change cannot be undone.
+            make: Function from the wanted state to the next.
+            label: Words of the edit; None is no edit, and cannot be undone.
         """
         with self.changed:
             before, wanted = self.wanted, make(self.wanted)
@@ -240,36 +228,36 @@ class Controls:
             self._adopt(wanted)
 
     def undo(self) -> None:
-        """Undo the last edit, if there is one."""
+        """Take the last edit back; without one nothing happens."""
         with self.changed:
             self._adopt(self._history.move(self.wanted, back=True))
 
     def redo(self) -> None:
-        """Redo the edit that was undone last, if there is one."""
+        """Make the edit again that was taken back last; without one nothing happens."""
         with self.changed:
             self._adopt(self._history.move(self.wanted, back=False))
 
     def give_back(self, good: Wanted, refused: Wanted) -> None:
-        """Restore the last good state if the refused state, whose pipeline could not be built, is still wanted."""
+        """Want again the state before an edit that could not be built, unless something else is wanted by now."""
         with self.changed:
             if self.wanted is refused:
                 self._history.drop(good)
                 self._adopt(good)
 
     def start_anew(self, wanted: Wanted) -> None:
-        """Show another scene and forget the edits of the previous one."""
+        """Want another scene; edits of the one before are forgotten."""
         with self.changed:
             self._history.clear()
             self._adopt(wanted)
 
     def scene_message(self) -> dict[str, Any]:
-        """Return the message of the edited scene, with the labels of the edits that undo and redo would affect."""
+        """Return the message of the scene as it is edited, with the edits that can be undone."""
         with self.changed:
             undo, redo = (edits[-1][0] if edits else None for edits in (self._history.done, self._history.undone))
             return {"type": "scene", "scene": wanted_record(self.wanted), "undo": undo, "redo": redo}
 
     def camera_of(self, feed: Feed, wanted: Wanted | None = None) -> Camera:
-        """Return a feed's camera: calibrated on the page, else the feed's own, else the scene's."""
+        """Return the camera that took a feed's frames, as far as it is known."""
         wanted = wanted or self.wanted
         return wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
 
@@ -278,10 +266,10 @@ class Controls:
         self.changed.notify_all()
 
     def set_compare(self, other: str) -> None:
-        """Choose the picture to compare with.
+        """Choose what stands beside the picture.
 
         Raises:
-            UsageError: ``other`` is not a known comparison.
+            UsageError: There is no such choice.
         """
         if other not in ("", CAMERA, *CONVERGING, *PRESETS):
             known = ", ".join((CAMERA, *CONVERGING))
@@ -291,13 +279,13 @@ class Controls:
             self._touch()
 
     def play(self, on: bool) -> None:
-        """Play frames (True), or hold the present frame (False)."""
+        """Let frames flow, or hold the one in hand."""
         with self.changed:
             self.playing = on
             self.changed.notify_all()
 
     def watch(self, change: int) -> None:
-        """Count one viewer more (1) or less (-1)."""
+        """One viewer more (1) or less (-1)."""
         with self.changed:
             self.watchers += change
             self.edits += change > 0
@@ -312,7 +300,7 @@ class Controls:
             self.feed.source.close()
 
     def switch(self, feed: Feed) -> None:
-        """Use another feed after the present frame."""
+        """Go on with another source after the frame in hand."""
         with self.changed:
             left, self._next = self._next, feed
             current = self.feed.source
@@ -323,7 +311,7 @@ class Controls:
             current.close()
 
     def adopt(self) -> bool:
-        """Start to use the feed that was requested last; return False if none was requested."""
+        """Take the feed that was asked for last; return True if there was one."""
         with self.changed:
             if self._next is None:
                 return False
@@ -334,7 +322,7 @@ class Controls:
         return True
 
     def use_estimate(self, camera: Camera, feed: Feed) -> bool:
-        """Use the camera estimated from a feed's frames; return False if that feed is no longer in use."""
+        """Use the camera estimated from a feed's frames; return False if the feed has been left."""
         with self.changed:
             if self._next is not None or self.feed is not feed:
                 return False
@@ -343,7 +331,7 @@ class Controls:
         return True
 
     def close(self) -> None:
-        """Close all sources."""
+        """Let the sources go."""
         self.stopped = True
         for feed in (self.feed, self._next):
             if feed is not None:
@@ -351,52 +339,45 @@ class Controls:
 
 
 DEFAULT_FIELD_OF_VIEW: Final = 60.0
-"""Horizontal field of view, degrees: between those of phones' main cameras (65 to 70) and of laptops (50 to 60)."""
+"""Horizontal, degrees: between a phone's main camera (65 to 70) and a laptop's (50 to 60)."""
 
 
 def guessed_camera(width: int, height: int, transfer: Any = "srgb", focal: float | None = None) -> Camera:
-    """Return a camera with square pixels, a central principal point and no distortion.
-
-    Args:
-        width: Columns of its frames.
-        height: Rows of its frames.
-        transfer: Transfer function, as in a scene file.
-        focal: Focal length, pixels; None means that of the default field of view.
-    """
+    """Return a camera with square pixels, a central principal point, no distortion, and the default field of view."""
     focal = focal or 0.5 * width / math.tan(0.5 * math.radians(DEFAULT_FIELD_OF_VIEW))
     return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), transfer=transfer)
 
 
 _LEAD_MS: Final = 40.0
-"""Typical time to encode, send and decode a picture of a browser's camera, milliseconds."""
+"""Typical time for a picture of a browser's camera to be packed, sent and unpacked."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pushed:
-    """Picture of a browser's camera that waits to be lit."""
+    """A picture of a browser's camera on its way to being lit."""
 
     image: Image
     id: int
     taken: float
-    """Time of arrival, seconds of ``time.monotonic``."""
+    """Time at which it came, seconds of ``time.monotonic``."""
     stamp: float
-    """Time of capture, milliseconds on the browser's own clock."""
+    """Time at which it was taken, milliseconds of the browser's own clock."""
 
 
 class BrowserCamera:
-    """Receiver of pictures from a viewer's camera. Methods may be called from any thread."""
+    """Takes pictures that a viewer pushes. Methods may be called from any thread."""
 
     def __init__(self, controls: Controls, notify: Notify) -> None:
         self._controls, self._notify = controls, notify
         self._choosing = threading.Lock()
-        """Lock of ``use``: of two viewers that offer their cameras at once, one is refused."""
+        """Held by who makes a camera the source: of two viewers who ask at once one is refused."""
         self._pushed: collections.deque[Pushed] = collections.deque(maxlen=4)
 
     def use(self, width: int, height: int, owner: object) -> None:
-        """Make the camera of the viewer ``owner`` the source.
+        """Make ``owner``'s camera the source.
 
         Raises:
-            UsageError: Another viewer's camera is the source.
+            UsageError: Another viewer's camera is.
         """
         controls = self._controls
         with self._choosing:
@@ -412,17 +393,17 @@ class BrowserCamera:
         return feed.is_browser and feed.owner is owner
 
     def size(self, owner: object) -> tuple[int, int] | None:
-        """Return the size of the pictures that ``owner`` may push; None if its camera is not the source."""
+        """Return the size of the pictures that ``owner`` may push now; None if it is not the source."""
         return self._controls.newest_feed.source.size if self.is_of(owner) else None
 
     def push(self, taken: protocol.Picture, owner: object) -> None:
-        """Decode a picture and queue it as a frame; blocks while decoding.
+        """Take a picture; blocks while it is decoded.
 
-        When the frame is about to be lit, ``begin`` sends the page the message ``taken``, after which the page sends
-        the next picture. A picture sent earlier would only replace the queued one.
+        The page hears of it again, as ``taken``, when it is its turn to be lit: sooner, another would only take its
+        place.
 
         Raises:
-            ProtocolError: The picture cannot be decoded.
+            ProtocolError: It cannot be decoded.
         """
         picture = decode_picture(taken.jpeg, cv2.IMREAD_COLOR_RGB, protocol.ProtocolError, "picture")
         feed = self._controls.newest_feed
@@ -434,15 +415,15 @@ class BrowserCamera:
         feed.source.push(picture, now)
 
     def begin(self, image: Image, busy_ms: float) -> Pushed | None:
-        """Tell the page that a frame is about to be lit; return the frame's record, or None if no viewer pushed it.
+        """Say that a frame is about to be lit; return its record if it was pushed.
 
         Args:
             image: The frame.
-            busy_ms: Time that lighting a frame takes, milliseconds.
+            busy_ms: Time that lighting a frame takes.
         """
         pushed = next((item for item in tuple(self._pushed) if item.image is image), None)
         if pushed is not None:
-            # The next picture should arrive just when this frame is done: no earlier, or it would wait and age.
+            # The next one shall come when this one is done, not sooner, and not have waited by then.
             wait = max(busy_ms - _LEAD_MS, 0.0)
             self._notify({"type": "taken", "id": pushed.id, "wait": round(wait, 1)})
         return pushed
