@@ -3,12 +3,20 @@
 import numpy as np
 import warp as wp
 
-from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
+from tests.kernel_rig import (
+    TEXTURES,
+    as_compiled,
+    camera_fields,
+    constant_environment,
+    records,
+    shape,
+    tables,
+    trace_of,
+)
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, RAYS, H, W
 from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, SampleSets
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter
 from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue, shaded_shape
 from warp_ar.kernels.structs import (
@@ -115,10 +123,9 @@ def run(
     single_sided=0,
 ):
     """Shade a desk; ``loaded`` is a scene whose objects are there in place of ``objects``."""
-    kinds = tuple(tuple(sorted({item["kind"] for item in items})) for items in (objects, proxies))
     several = others is not None
-    trace = TraceConfig(*kinds) if loaded is None else TraceConfig((MESH,), kinds[1], detail=True)
-    forms = DistantLightConfig(trace, (LAMBERT,), False, "sh", False, bool(probes), several=several)
+    trace = trace_of(objects, proxies) if loaded is None else trace_of([{"kind": MESH}], proxies, detail=True)
+    forms = as_compiled(DistantLightConfig(trace, (LAMBERT,), False, "sh", False, True, several=several), form="sh")
     config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials, queued)
     camera = camera_fields(CAMERA, LOOK_DOWN, 60, (H, W))
     params = records(FrameParams, {**camera, "shadow_rect": rect})

@@ -10,9 +10,11 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.kernels import color
+from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.structs import Material
 from warp_ar.scene import Pose
 from warp_ar.stages.base import Pass
+from warp_ar.stages.shared.lighting import shares_kernels
 
 SMALL_CAMERA = """[camera]
 width = 64
@@ -70,6 +72,18 @@ def shape(kind: int, position: Any, extent: Any, material: int = -1) -> dict[str
     """Fields of a ``Shape`` that is not turned."""
     place = {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0}
     return {**place, "extent": extent, "material": material}
+
+
+def as_compiled(config: Any, **options: Any) -> Any:
+    """A configuration as pipelines compile it: on CPU, where scenes share kernels, the general one."""
+    return config.general(**options) if shares_kernels(wp.get_device()) else config
+
+
+def trace_of(objects: Sequence[dict[str, Any]], proxies: Sequence[dict[str, Any]], **detail: bool) -> TraceConfig:
+    """Kinds of these shapes, as pipelines compile them."""
+    kinds = (tuple(sorted({int(one["kind"]) for one in shapes})) for shapes in (objects, proxies))
+    found: TraceConfig = as_compiled(TraceConfig(*kinds, **detail))
+    return found
 
 
 def tables(transfer: str = "srgb") -> tuple[wp.array, wp.array]:

@@ -7,12 +7,21 @@ import math
 import numpy as np
 import warp as wp
 
-from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, look_at, records, shape, tables
+from tests.kernel_rig import (
+    TEXTURES,
+    as_compiled,
+    camera_fields,
+    constant_environment,
+    look_at,
+    records,
+    shape,
+    tables,
+    trace_of,
+)
 from tests.reference import color as reference_color
 from warp_ar.kernels import color
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.objects.shade import ShadeConfig
-from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import mirror_ball
 from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.structs import (
@@ -101,18 +110,15 @@ def run(
     rows=None,
     out=None,
     irradiance=None,
-    config=None,
 ):
     """The change of radiance, (H, W, 3); objects are lit by ``lights`` and the even environment ``irradiance``."""
     frame = grey_frame() if frame is None else frame
-    trace = TraceConfig(kinds(objects), kinds(proxies))
+    trace = trace_of(objects, proxies)
     models = tuple(sorted({one["model"] for one in materials}))
-    if config is None:
-        lit = irradiance is not None
-        forms = DistantLightConfig(trace, models, False, "sh" if lit else "none", lit, True)
-        shading = ShadeConfig(forms, kinds(lights), 1)
-        relighting = RelightConfig(method, trace, "sh") if lights and proxies else None
-        config = mirror_ball.MirrorBallConfig(trace, shading if objects else None, relighting, ratio is not None)
+    lit = irradiance is not None
+    forms = DistantLightConfig(trace, models, False, "sh" if lit else "none", lit, lit)
+    shading = as_compiled(ShadeConfig(forms, kinds(lights), 1), form="sh", soft=False)
+    config = mirror_ball.MirrorBallConfig(trace, shading, RelightConfig(method, trace, "sh"), ratio=True)
     inverse = pose.inverse()
     camera = camera_fields(inverse.translation, inverse.rotation, FOCAL, (H, W))
     params = records(FrameParams, {**camera, "ball_rect": rect})
@@ -120,7 +126,7 @@ def run(
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
     scene.materials = records(Material, *[{**dict.fromkeys(TEXTURES, -1), **one} for one in materials])
     receiver = make_receiver(
-        config.relight or RelightConfig(method, trace),
+        config.relight,
         make_picture(wp.array(frame, dtype=wp.vec3ub), tables()[0], wp.array(rays, dtype=wp.vec2)),
         probes=records(Probe, *balls),
         key_lights=records(KeyLight, {"direction": KEY, "directionality": DIRECTIONALITY}),

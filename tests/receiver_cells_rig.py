@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import warp as wp
 
-from tests.kernel_rig import constant_environment, records, shape, tables
+from tests.kernel_rig import constant_environment, records, shape, tables, trace_of
 from tests.reference import receiver_cells as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, point
-from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import receiver_cells, relight
 from warp_ar.kernels.receiver.receiver import ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.receiver.receiver_cells import Patch
@@ -79,10 +78,7 @@ class View:
         """``sees_boxes``: what stands on the desk is in the frame; else the lens's axis passes far from it."""
         forms = {**forms, "several": others is not None}
         self.others = others
-        kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
-        trace = TraceConfig(
-            tuple(sorted({int(item["kind"]) for item in objects})), kinds if scene is None else (BOX, PLANE, MESH)
-        )
+        trace = trace_of(objects, proxies if scene is None else [{"kind": kind} for kind in (BOX, PLANE, MESH)])
         self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", **forms)
         self.config = self.relight
         self.size = size

@@ -3,10 +3,9 @@
 import numpy as np
 import warp as wp
 
-from tests.kernel_rig import constant_environment, records, shape, tables
+from tests.kernel_rig import constant_environment, records, shape, tables, trace_of
 from tests.reference import relight as reference
 from warp_ar.kernels.edges import EdgeLists
-from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import relight
 from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.structs import PLANE, POINT, FrameParams, KeyLight, Light, Probe, RayScene, Shape, make_picture
@@ -60,7 +59,7 @@ def run(
     frame = np.full((H, W, 3), 128, np.uint8) if frame is None else frame
     config = RelightConfig(
         method,
-        TraceConfig(tuple(sorted({o["kind"] for o in objects})), tuple(sorted({p["kind"] for p in proxies}))),
+        trace_of(objects, proxies),
         "sh" if irradiance_map is None else "map",
         several=others is not None,
     )
@@ -110,8 +109,7 @@ def run_edges(
     columns, lines = np.meshgrid(
         (np.arange(width) - (width - 1) / 2) / (60 * detail), (np.arange(height) - (height - 1) / 2) / (60 * detail)
     )
-    kinds = [tuple(sorted({s["kind"] for s in shapes})) for shapes in (objects, proxies)]
-    config = RelightConfig("reflectance", TraceConfig(*kinds), "sh", soft=soft, edge_samples=samples)
+    config = RelightConfig("reflectance", trace_of(objects, proxies), "sh", soft=soft, edge_samples=samples)
     place = {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect, "focal": (60, 60)}
     params = records(FrameParams, place)
     scene = RayScene()

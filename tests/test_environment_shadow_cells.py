@@ -24,8 +24,8 @@ pytestmark = pytest.mark.slow
 # --- Cells ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("secondary", "bounce"), [(1.0, "estimated"), (0.5, "traced")])
-def test_queued_rays_find_the_same(device, bounce, secondary):
+@pytest.mark.parametrize(("secondary", "bounce", "partials"), [(1.0, "estimated", 2), (0.5, "traced", 8)])
+def test_queued_rays_find_the_same(device, bounce, secondary, partials):
     """By one kernel or by three: with a box, a ball and a lamp at a place, all of which may be before the objects."""
     drawn = draw(with_sun(6, 20, 100.0))
     environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), ONE_BALL, drawn[2])
@@ -41,11 +41,10 @@ def test_queued_rays_find_the_same(device, bounce, secondary):
     }
     one = run(drawn, **scene)
     assert one.min() < 0.7
-    for partials in (2, 8):
-        found = run(drawn, **scene, partials=partials, queued=True)
-        np.testing.assert_allclose(found, one, atol=SUM_ERROR)
-        np.testing.assert_array_equal(run(drawn, **scene, partials=partials, queued=True), found)
-    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, queued=True)
+    found = run(drawn, **scene, partials=partials, queued=True)
+    np.testing.assert_allclose(found, one, atol=SUM_ERROR)
+    np.testing.assert_array_equal(run(drawn, **scene, partials=partials, queued=True), found)
+    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=partials, queued=True)
     assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
 
 
@@ -69,7 +68,7 @@ def test_what_is_seen_from_one_side_hides_the_sky_from_both(device, tmp_path, se
     }
     expected, _ = run(drawn, **about)
     assert (expected < 0.5).mean() > 0.02
-    for way in ({}, {"queued": True, "partials": 4}):
+    for way in ({}, {"queued": True, "partials": 8}):
         ratio, _ = run(drawn, **about, single_sided=1, **way)
         np.testing.assert_allclose(ratio, expected, atol=SUM_ERROR)
 

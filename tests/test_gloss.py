@@ -10,7 +10,16 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
-from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, shape, tables
+from tests.kernel_rig import (
+    TEXTURES,
+    as_compiled,
+    camera_fields,
+    constant_environment,
+    records,
+    shape,
+    tables,
+    trace_of,
+)
 from tests.mirror_ball_rig import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame
 from tests.reference import color as reference_color
 from tests.reference import gloss as reference
@@ -19,7 +28,6 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.objects.shade import ShadeConfig
-from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.receiver import gloss
 from warp_ar.kernels.structs import (
     LAMBERT,
@@ -75,11 +83,10 @@ def run(
 ):
     """What the receiver changes, (H, W, 3), in even surroundings."""
     roughness, f0 = material
-    kinds = tuple(sorted({one["kind"] for one in objects})), tuple(sorted({one["kind"] for one in proxies}))
-    trace = TraceConfig(*kinds)
+    trace = trace_of(objects, proxies)
     lit = tuple(sorted({one["kind"] for one in lights}))
     forms = DistantLightConfig(trace, (LAMBERT,), False, "sh", True, True)
-    config = gloss.GlossConfig(trace, samples, lit, ShadeConfig(forms, lit, 1) if objects else None)
+    config = gloss.GlossConfig(trace, samples, lit, as_compiled(ShadeConfig(forms, lit, 1), form="sh", soft=False))
     inverse, whole = pose.inverse(), (0, H, 0, W)
     camera = camera_fields(inverse.translation, inverse.rotation, FOCAL, (H, W))
     params = records(FrameParams, {**camera, "ball_rect": whole, "shadow_rect": whole})

@@ -6,14 +6,13 @@ import warp as wp
 
 from tests.environment_shadow_rig import COUNT, SIDE, draw, sky, sphere
 from tests.error_model import check_error
-from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, tables
+from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, tables, trace_of
 from tests.reference import near_field as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
 from warp_ar.kernels.environment.lobes import lobe_texels
 from warp_ar.kernels.objects import near_field
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.picture import frame_levels
-from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.rays.visibility import make_visible, trace_pixels
 from warp_ar.kernels.structs import (
     LAMBERT,
@@ -58,7 +57,7 @@ def run(
 ):
     models = tuple(sorted({m["model"] for m in materials}))
     forms = DistantLightConfig(
-        TraceConfig((SPHERE,), (DESK["kind"],)),
+        trace_of([{"kind": SPHERE}], [DESK]),
         models,
         False,
         "sh" if set(models) - {MIRROR} else "none",
@@ -271,7 +270,7 @@ def average(
     """Filter estimates as given, (h, w); object k has material k, of model k and this surface."""
     height, width = found.shape
     forms = DistantLightConfig(
-        TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False
+        trace_of([{"kind": SPHERE}], [DESK]), tuple(sorted(set(models))), False, "sh", True, False
     )
     config = near_field.NearFieldConfig(forms, COUNT, lobes, 1, SIDE, False, False)
     scene = RayScene()

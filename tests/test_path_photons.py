@@ -198,7 +198,7 @@ def test_near_emitters_have_the_same_mean_both_ways(name: str, device: str, monk
     """
     scene, sky = EMITTER_CASES[name], lamp_above()
     off, brought = [], []
-    for seed in range(24):
+    for seed in range(12):
         pair = [tracer_of(scene, device, 16, seed, monkeypatch, sky=sky, follows=follows) for follows in (True, False)]
         assert pair[0]._follows_emitters
         assert pair[0]._follows_lights == (name == "emitter and light")

@@ -37,22 +37,22 @@ def test_edges_of_proxies_are_means_over_pixels(device):
     lights = [point((0.0, 0.0, 0.5))]
     hard = run_edges(1, lights, proxies=(DESK, box))
     truth = pixel_means(run_edges(1, lights, proxies=(DESK, box), rect=(0, 16 * H, 0, 16 * W), detail=16), 16)
-    smooth = run_edges(16, lights, proxies=(DESK, box))
+    smooth = run_edges(4, lights, proxies=(DESK, box))
     edges = np.abs(hard - truth).max(-1) > 0.02 * truth.max()
     assert edges.sum() > 50
     before, after = (np.sqrt(((picture - truth)[edges] ** 2).mean()) for picture in (hard, smooth))
-    assert after < before / np.sqrt(16), "no better than as many random samples"
+    assert after < before / np.sqrt(4), "no better than as many random samples"
     assert (hard == smooth).all(-1).mean() > 0.7
-    dark = run_edges(16, [point((0.0, 0.0, -1.0))], proxies=(DESK, box))
+    dark = run_edges(4, [point((0.0, 0.0, -1.0))], proxies=(DESK, box))
     assert not dark.any()
 
 
 def test_edges_of_cones_and_penumbrae_stay(device):
     """Both are smooth already: samples there would be wasted."""
     spot = {**point((0.05, 0.0, 0.4)), "kind": SPOT, "direction": (0, 0, -1), "inner_angle": 0.1, "outer_angle": 0.3}
-    assert (run_edges(1, [spot]) == run_edges(16, [spot])).all()
+    assert (run_edges(1, [spot]) == run_edges(4, [spot])).all()
     wide = [point((-0.1, 0.05, 0.5), radius=0.05)]
-    hard, smooth = (run_edges(samples, wide, [HANGING], soft=True) for samples in (1, 16))
+    hard, smooth = (run_edges(samples, wide, [HANGING], soft=True) for samples in (1, 4))
     assert (hard == smooth).all()
     assert len(np.unique(hard)) > 100, "no penumbra"
 
@@ -61,7 +61,7 @@ def test_edges_leave_balls_to_themselves(device):
     """Pixels of a ball stay black; those beside it are not darkened by what they see of it."""
     ball = {"center": (0.0, 0.0, 0.03), "radius": 0.03, "reflectance": (0.6, 0.6, 0.6)}
     lights = [point((0.0, 0.0, 0.55))]
-    hard, smooth = (run_edges(samples, lights, probes=[ball]) for samples in (1, 16))
+    hard, smooth = (run_edges(samples, lights, probes=[ball]) for samples in (1, 4))
     shown = np.hypot(COLUMNS, ROWS) < 0.03 / np.sqrt(0.57**2 - 0.03**2)
     assert shown.sum() > 20
     assert not smooth[shown].any()

@@ -26,19 +26,8 @@ SIZE = (48, 64)
 FOCAL = 60.0
 LEVEL_HEIGHT = 16
 EVERYTHING = ShadeConfig(
-    distant=DistantLightConfig(
-        trace=GENERAL,
-        models=(LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR),
-        textures=True,
-        diffuse="sh",
-        specular=True,
-        known=False,
-    ),
-    lights=(structs.POINT, structs.SPOT, structs.DIRECTIONAL),
-    edge_samples=4,
-)
-DARK = dataclasses.replace(EVERYTHING.distant, diffuse="none", specular=False)
-"""An environment without light."""
+    DistantLightConfig(GENERAL, (), textures=True, diffuse="sh", specular=True, known=True), (), edge_samples=4
+).general("sh", soft=False)
 
 # Nine coefficients and the packed levels each hold a constant to a few roundings.
 FURNACE_TOLERANCE = 1e-5
@@ -185,10 +174,9 @@ def test_matches_reference(device):
     world.add("box", extent=(3, 3, 0.1), at=(0, 0, 3.2), rotate=(20, 10, 0))
     base = np.array([[0.8, 0.2, 0.1], [0.1, 0.7, 0.2], [0.5, 0.5, 0.5]])
     scene = scene_of(world, *({"model": LAMBERT, "base_color": color} for color in base), device=device)
-    config = dataclasses.replace(EVERYTHING, distant=dataclasses.replace(DARK, models=(LAMBERT,), textures=False))
     position, intensity = np.array([-1.2, -0.9, 0.6]), np.array([3.0, 2.0, 1.0])
     light = lights({"kind": structs.POINT, "position": position, "intensity": intensity}, device=device)
-    image = render(scene, config, device, light_array=light)
+    image = render(scene, EVERYTHING, device, light_array=light, light_environment=0.0)
 
     samples = []
     for b in range(2):

@@ -21,8 +21,7 @@ from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_mesh import make_ray_mesh
 from warp_ar.scene.shapes import box_mesh, sphere_mesh, torus_mesh
 
-EVERY = (structs.PLANE, structs.BOX, structs.MESH, structs.SPHERE)
-GENERAL = TraceConfig(EVERY, EVERY)
+GENERAL = TraceConfig((), ()).general()
 
 # Float32 positions and directions of order 1 carry 6e-8 each; some twenty roundings reach t and point, and a grazing
 # angle of 3 degrees multiplies them by 20.
