@@ -1,17 +1,17 @@
-"""A frame on CPU without Python in between: native threads take bands of rows and call the kernels themselves.
+"""Native scheduler of a frame on CPU: threads take bands of rows and call the kernels' entry points without Python.
 
-A Warp CPU launch uses one thread, and starting one takes Python some 50 microseconds under the interpreter's lock:
-with sixteen threads that is most of a frame. So launches are packed once, into the tables below, and every thread of a
-frame runs ``serve``, which takes the next rows of the first stage that has some, calls the kernel's entry point over
-them, and sleeps when there is nothing to take. Only steps that Python must do call back into it.
+A Warp CPU launch uses one thread, and each launch takes Python some 50 microseconds under the interpreter's lock. With
+sixteen threads that would be most of a frame. Therefore launches are packed once into the tables below, and every
+thread runs ``serve``. It takes rows of the first stage that has work, calls the kernel's entry point on them, and
+sleeps when there is no work. Python is called back only for steps in Python.
 
-A stage waits for those that write what it reads; its passes go one after another, and the rows of a pass side by side.
-Threads take half of what each thread's share is of the rows that are left: large pieces first, small ones last, none
-shorter than what was measured to be worth the taking, ``WORTH``.
+A stage waits for the stages that write its inputs. Its passes run one after another; bands of one pass run in parallel.
+A thread takes the remaining rows over twice the number of threads. So pieces are large at first and small at the end,
+but none takes less than the time ``WORTH``, below which taking a piece costs too much.
 
-All is C++ inside one Warp kernel, compiled by Warp's own Clang: no compiler need be there. The tables are arrays of
-64-bit integers whose columns are named below. What the operating system gives (a semaphore, a clock, a way to let
-others run) comes in as addresses of its functions.
+All of it is C++ inside one Warp kernel, compiled by Warp's own Clang, so that no other compiler is needed. The tables
+are arrays of 64-bit integers whose columns are named below. Functions of the operating system (semaphore, clock, yield)
+are passed in as addresses.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ wp.set_module_options({"enable_backward": False})
 
 STATE = (
     "lock",  # 1: held
-    "open",  # stages of this frame that are not done
-    "idle",  # threads that sleep
-    "caller_idle",  # 1: the thread that asked for the frame sleeps
+    "open",  # number of unfinished stages of this frame
+    "idle",  # number of sleeping threads
+    "caller_idle",  # 1: the thread that requested the frame sleeps
     "stop",  # 1: threads return
-    "failed",  # 1: a callback raised an error; no more is begun
+    "failed",  # 1: a callback raised an error; no further piece is started
     "threads",
-    "bands",  # 0: rows are taken by need; else so many equal bands per pass
-    "tiles",  # 1: a pass that uses tiles is under way
-    "news",  # grows when there is something new to take
-    "stages",  # how many
+    "bands",  # number of equal bands per pass; 0: sizes by the remaining rows
+    "tiles",  # 1: a pass that uses tiles is running
+    "news",  # counter of events that may give a thread new work
+    "stages",  # number of stages
     "clock_id",
     "semaphore",
     "caller_semaphore",
@@ -45,10 +45,13 @@ STATE = (
     "call_table",
     "reader_table",
 )
-"""Columns of the one row of the state."""
+"""Columns of the state table, which has one row."""
 
 STAGE = ("waits", "first_pass", "last_pass", "current", "ready", "first_reader", "last_reader")
-"""Fields of a stage: missing inputs, its passes and the current one, whether that may be taken, its readers."""
+"""Fields of a stage: number of unfinished inputs; first, last and current pass; state of that pass; its readers.
+
+``ready`` is 1 while rows of the current pass may be taken, and 2 before the frame for a stage without inputs.
+"""
 
 PASS = (
     "first_call",
@@ -56,18 +59,18 @@ PASS = (
     "start",  # rows of this frame
     "stop",
     "whole",  # 1: cannot be split
-    "tiles",
-    "callback",  # number of a step of Python's, or -1
-    "taken",  # rows
-    "out",  # pieces under way
-    "time",  # nanoseconds, of all threads
-    "row_time",  # picoseconds, by what was measured last; 0: not yet
+    "tiles",  # 1: uses tiles, so that only one such piece may run at a time
+    "callback",  # number of a step in Python; -1: none
+    "taken",  # first row that is not taken yet
+    "out",  # number of pieces being computed
+    "time",  # nanoseconds, summed over all threads
+    "row_time",  # picoseconds per row in the last frame; 0: not measured yet
 )
 CALL = (
-    "entry",  # address; 0: a copy
-    "arguments",  # address of what is packed, or the target
-    "argument_bytes",  # or bytes per row
-    "row_offset",  # of ``row_start`` in the arguments; -1: the kernel knows no bands. Of a copy: the source
+    "entry",  # address of the kernel's entry point; 0: a copy of memory
+    "arguments",  # address of the packed arguments; of a copy, the target
+    "argument_bytes",  # of a copy, bytes per row
+    "row_offset",  # offset of ``row_start`` in the arguments, -1 for a kernel without bands; of a copy, the source
     "bounds",  # address of the launch's bounds
     "bounds_bytes",
     "size_offset",
@@ -75,13 +78,13 @@ CALL = (
 )
 
 ARGUMENT_ROOM = 8192
-"""Bytes of the largest arguments that can be packed."""
+"""Largest size of packed arguments, bytes."""
 BOUNDS_ROOM = 64
-"""The same of a launch's bounds."""
+"""Largest size of a launch's bounds, bytes."""
 MOST_STAGES = 64
-"""Stages that can begin at once."""
+"""Largest number of stages that can start at once."""
 WORTH = 30_000
-"""Nanoseconds that the shortest piece takes."""
+"""Shortest computing time of a piece, nanoseconds."""
 
 
 def _struct(name: str, fields: tuple[str, ...]) -> str:
@@ -297,13 +300,14 @@ def _struct(name: str, fields: tuple[str, ...]) -> str:
 """
 )
 def serve(state: wp.uint64, caller: wp.int32) -> wp.int32:
-    """Take what is to be done: as the caller until the frame is done, as a thread of its own until all is stopped.
+    """Compute pieces of stages until the frame is done (``caller`` 1) or until ``stop`` is set (``caller`` 0).
 
-    The result is 1 if a callback failed.
+    Returns:
+        1 if a callback failed, else 0.
     """
 
 
 @wp.kernel(enable_backward=False)
 def serve_kernel(state: wp.uint64, caller: wp.int32, failed_out: wp.array[wp.int32]):
-    """One thread: ``serve``."""
+    """Run ``serve`` on one thread."""
     failed_out[0] = serve(state, caller)

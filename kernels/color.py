@@ -1,4 +1,4 @@
-"""Between 8-bit camera codes and linear radiance, for a known transfer function.
+"""Conversion between 8-bit camera codes and linear radiance, for a known transfer function.
 
 A transfer is ``"srgb"``, ``"linear"``, ``"gamma:<exponent>"`` or the path of a measured response: a text file of 256
 lines with three numbers, the linear red, green and blue value of each code. Linear values are camera values: 0 is
@@ -14,9 +14,10 @@ of its neighbours. Each threshold is rounded *up* to float32: a float32 number r
 if it reaches the real one, so the codes are those of real arithmetic for every float32 input, and the largest error
 is half a code (ties go up). CPU and CUDA agree bit for bit.
 
-Counting starts from a table of ``ENCODE_KEYS`` cells over sqrt(x): how many thresholds lie safely below the cell, and
-the next one. Almost always that comparison ends it, without a branch or a power function. A cell that holds more than
-one threshold (a plateau of a measured response, an exponent above 3) is marked by a half, and counts on.
+The count is looked up in a table of ``ENCODE_KEYS`` intervals of sqrt(x). Each entry holds the number of thresholds
+below the interval and the next threshold. One comparison with the latter usually completes the count, without a branch
+or a power function. An interval with more than one threshold (a plateau of a measured response, an exponent above 3)
+is marked by adding 1/2 to its count; there a loop continues the count.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from warp_ar.srgb import decode_srgb
 wp.set_module_options({"enable_backward": False})
 
 ENCODE_KEYS = 1024
-"""Cells of the encoder's first look-up; up to an exponent of 3, thresholds fall into cells of their own."""
+"""Number of intervals in the encode table; for exponents up to 3 each holds at most one threshold."""
 ENCODE_LENGTH = 2 * ENCODE_KEYS + 256
-"""Entries of an encode table: counts of the cells, their next thresholds, all thresholds (the last one infinite)."""
+"""Length of an encode table: counts of the intervals, their next thresholds, all thresholds (the last infinite)."""
 
 _KEY_SCALE = wp.constant(wp.float32(ENCODE_KEYS - 1))
 _NEXT = wp.constant(ENCODE_KEYS)
@@ -43,34 +44,34 @@ _THRESHOLDS = wp.constant(2 * ENCODE_KEYS)
 
 SATURATION_ENTRY = wp.constant(256)
 """Entry of a ``camera_table`` that holds the codes at which channels saturate."""
-# Video codecs and JPEG bring a clipped 255 back as 254 now and then.
+# Video codecs and JPEG sometimes decode a clipped 255 as 254.
 BELOW_SATURATION = wp.constant(wp.float32(-1.0))
 # Chroma at half the resolution (4:2:0) lowers the clipped blue of a small emitter to 239 to 252 (measured in H.264).
-# Where another channel clips, what is so near to clipping counts; lower codes are as often what the camera saw.
+# If another channel clips, codes down to 7 below saturation count as clipped; lower codes are often true values.
 BESIDE_SATURATION = wp.constant(wp.float32(-7.0))
 
 
 @wp.func
 def luminance(radiance: wp.vec3) -> wp.float32:
-    """Rec. 709 luminance of linear RGB."""
+    """Return the Rec. 709 luminance of linear RGB."""
     return 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
 
 
 @wp.func
 def brightness(radiance: wp.vec3) -> wp.float32:
-    """Mean of the channels: where change of any colour counts alike."""
+    """Return the mean of the channels, which weights changes of all colours equally."""
     return (radiance[0] + radiance[1] + radiance[2]) / 3.0
 
 
 @wp.func
 def decode(table: wp.array[wp.vec3], code: wp.vec3ub) -> wp.vec3:
-    """Linear value of an 8-bit colour; ``table`` comes from ``decode_table``."""
+    """Return the linear value of an 8-bit colour; ``table`` comes from ``decode_table``."""
     return wp.vec3(table[wp.int32(code[0])][0], table[wp.int32(code[1])][1], table[wp.int32(code[2])][2])
 
 
 @wp.func
 def saturation_codes(table: wp.array[wp.vec3]) -> wp.vec3:
-    """Code at which each channel saturates: the last entry of a ``camera_table``, 255 in a plain ``decode_table``."""
+    """Return the code at which each channel saturates: the last entry of a ``camera_table``, else 255."""
     if table.shape[0] > SATURATION_ENTRY:
         return table[SATURATION_ENTRY]
     return wp.vec3(255.0, 255.0, 255.0)
@@ -78,7 +79,7 @@ def saturation_codes(table: wp.array[wp.vec3]) -> wp.vec3:
 
 @wp.func
 def below_saturation(code: wp.vec3ub, shown: wp.vec3ub, saturation: wp.vec3) -> wp.vec3ub:
-    """``code``, ended where the camera's channels saturate; but no darker than what the frame has ``shown`` there."""
+    """Limit ``code`` to the camera's saturation codes, but never below the frame's own code ``shown`` in that pixel."""
     return wp.vec3ub(
         wp.min(code[0], wp.max(shown[0], wp.uint8(saturation[0] + 0.5))),
         wp.min(code[1], wp.max(shown[1], wp.uint8(saturation[1] + 0.5))),
@@ -88,7 +89,7 @@ def below_saturation(code: wp.vec3ub, shown: wp.vec3ub, saturation: wp.vec3) -> 
 
 @wp.func
 def is_saturated(code: wp.vec3ub, saturation: wp.vec3) -> wp.vec3:
-    """1 in the channels that are at clipping, where they saturate at the codes ``saturation``."""
+    """Return 1 in each clipped channel and 0 in the others, for a camera that saturates at the codes ``saturation``."""
     r = wp.float32(code[0]) - saturation[0]
     g = wp.float32(code[1]) - saturation[1]
     b = wp.float32(code[2]) - saturation[2]
@@ -98,13 +99,13 @@ def is_saturated(code: wp.vec3ub, saturation: wp.vec3) -> wp.vec3:
 
 @wp.func
 def is_clipped(code: wp.vec3ub) -> wp.vec3:
-    """1 in the channels that are at clipping, where they saturate at 255."""
+    """Return 1 in each clipped channel and 0 in the others, for a camera that saturates at 255."""
     return is_saturated(code, wp.vec3(255.0, 255.0, 255.0))
 
 
 @wp.func
 def encode_channel(table: wp.array[wp.vec3], value: wp.float32, channel: wp.int32) -> wp.uint8:
-    """Nearest code of one linear value; below 0 and NaN give 0, above 1 and infinity give 255."""
+    """Return the nearest code of one linear value; values below 0 and NaN give 0, values above 1 give 255."""
     x = wp.where(value > 0.0, wp.min(value, 1.0), 0.0)  # NaN is not above 0
     key = wp.int32(wp.sqrt(x) * _KEY_SCALE)
     count = table[key][channel]
@@ -117,7 +118,7 @@ def encode_channel(table: wp.array[wp.vec3], value: wp.float32, channel: wp.int3
 
 @wp.func
 def encode(table: wp.array[wp.vec3], radiance: wp.vec3) -> wp.vec3ub:
-    """Nearest 8-bit colour of a linear one; ``table`` comes from ``encode_table``."""
+    """Return the nearest 8-bit colour of a linear colour; ``table`` comes from ``encode_table``."""
     return wp.vec3ub(
         encode_channel(table, radiance[0], 0),
         encode_channel(table, radiance[1], 1),
@@ -126,12 +127,11 @@ def encode(table: wp.array[wp.vec3], radiance: wp.vec3) -> wp.vec3ub:
 
 
 def decode_table(transfer: str | pathlib.Path) -> np.ndarray:
-    """Linear value of every code.
+    """Return the linear value of every code.
 
     Args:
-        transfer: ``"srgb"``, ``"linear"``, ``"gamma:2.2"`` or the path of a measured response. A response is known
-        only up to a factor,
-            so each of its channels is divided by its own last value: clipping becomes 1.
+        transfer: ``"srgb"``, ``"linear"``, ``"gamma:2.2"`` or the path of a measured response. A response is known only
+            up to a factor, so each of its channels is divided by its last value: clipping becomes 1.
 
     Returns:
         (256, 3) float32, non-decreasing from row to row, last row 1.
@@ -143,11 +143,11 @@ def decode_table(transfer: str | pathlib.Path) -> np.ndarray:
 
 
 def decode_codes(transfer: str | pathlib.Path, encoded: np.ndarray) -> np.ndarray:
-    """Linear value of codes of any depth.
+    """Return the linear values of codes of any bit depth.
 
     Args:
-        transfer: As for ``decode_table``; a measured response is interpolated linearly between its codes.
-        encoded: Codes over the largest one, (n,), 0 to 1.
+        transfer: See ``decode_table``; a measured response is interpolated linearly between its codes.
+        encoded: Codes divided by the largest code, (n,), 0 to 1.
 
     Returns:
         (n, 3) float64.
@@ -160,11 +160,11 @@ def decode_codes(transfer: str | pathlib.Path, encoded: np.ndarray) -> np.ndarra
 
 
 def encode_codes(transfer: str | pathlib.Path, light: np.ndarray) -> np.ndarray:
-    """Codes of linear values over the largest code, not rounded; the inverse of ``decode_codes``.
+    """Return codes of linear values, divided by the largest code and not rounded; the inverse of ``decode_codes``.
 
     Args:
-        transfer: As for ``decode_table``.
-        light: (..., 3); what is below 0 or above 1 is cut.
+        transfer: See ``decode_table``.
+        light: Linear values, (..., 3), clamped to 0..1; NaN counts as 0.
 
     Returns:
         float64 of the same shape, 0 to 1.
@@ -183,12 +183,12 @@ def encode_codes(transfer: str | pathlib.Path, light: np.ndarray) -> np.ndarray:
 def camera_table(
     transfer: str | pathlib.Path, saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255), contrast: float = 0.0
 ) -> np.ndarray:
-    """``decode_table``, and behind it the codes at which the camera's channels saturate.
+    """Return a ``decode_table`` followed by one row with the codes at which the camera's channels saturate.
 
     Args:
-        transfer: As for ``decode_table``.
-        saturation: Codes, (3,).
-        contrast: Of an S-shaped curve that the camera lays over its transfer, as for ``without_contrast``.
+        transfer: See ``decode_table``.
+        saturation: Code at which each channel saturates, (3,).
+        contrast: Strength of the camera's S-shaped contrast curve, see ``without_contrast``.
 
     Returns:
         (257, 3) float32.
@@ -200,14 +200,14 @@ def camera_table(
 def without_contrast(
     values: np.ndarray, contrast: float, saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255)
 ) -> np.ndarray:
-    """Linear value of every code of a camera that raises the contrast of what its transfer gives.
+    """Return the linear value of every code of a camera that applies a contrast curve after its transfer function.
 
-    With x that encoded value, 0 to 1, the code is y = x + a x (1 - x) (x - 1/2): both ends and the middle stay, for
-    a = 2 it is the smoothstep. It rises everywhere for -4 < a < 8. The curve ends where the camera does: x and y are
-    shares of the code at which a channel saturates.
+    The curve maps an encoded value x, 0 to 1, to y = x + a x (1 - x) (x - 1/2). Both ends and the middle are fixed, and
+    a = 2 is the smoothstep. The curve increases everywhere for -4 < a < 8. x and y are fractions of the code at which
+    the channel saturates.
 
     Args:
-        values: Linear value of every code without that, (256, 3).
+        values: Linear value of every code without the curve, (256, 3).
         contrast: a.
         saturation: Code at which each channel saturates, (3,).
 
@@ -225,7 +225,7 @@ def without_contrast(
 def encode_table(
     transfer: str | pathlib.Path, contrast: float = 0.0, saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255)
 ) -> np.ndarray:
-    """Table for the device function ``encode``; arguments and errors as ``camera_table``.
+    """Return the table for the device function ``encode``; see ``camera_table`` for arguments and errors.
 
     Returns:
         (``ENCODE_LENGTH``, 3) float32.
@@ -241,7 +241,7 @@ def encode_table(
     thresholds = np.where(thresholds < exact, np.nextafter(thresholds, np.float32(np.inf)), thresholds)
     table = np.full((ENCODE_LENGTH, 3), np.inf, np.float32)
     table[2 * ENCODE_KEYS : -1] = thresholds
-    # A threshold within rounding of a cell's edge belongs to both cells, whichever way a device's sqrt goes.
+    # A threshold within rounding of an interval's edge counts in both intervals, as sqrt may round either way.
     low, high = (
         np.floor(np.sqrt(thresholds.astype(np.float64) * (1.0 + margin)) * (ENCODE_KEYS - 1))
         for margin in (-1e-6, 1e-6)
@@ -256,7 +256,7 @@ def encode_table(
 
 
 def _formula(name: str, encoded: np.ndarray) -> np.ndarray:
-    """Linear value of encoded values in 0..1 for the transfers that have a formula."""
+    """Return the linear value of encoded values, 0 to 1, for a transfer that has a formula."""
     if name == "linear":
         return encoded
     if name == "srgb":
@@ -275,7 +275,7 @@ def _gamma(name: str) -> float:
 
 
 def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
-    """(256, 3) float64 linear values of the codes."""
+    """Return the linear values of all codes, (256, 3) float64."""
     name = str(transfer)
     if name in ("srgb", "linear") or name.startswith("gamma:"):
         return np.repeat(_formula(name, np.arange(256) / 255.0)[:, None], 3, axis=1)

@@ -1,8 +1,8 @@
-"""The latlong map: directions, texels and how to sample them.
+"""Latlong maps: directions, texels, solid angles and samples.
 
-A map has H rows and W columns (W = 2H where the program makes it, any size where a user does). Continuous coordinates
-``(row, column)`` run over [0, H] x [0, W]; texel (i, j) covers [i, i + 1] x [j, j + 1], its centre at half-integers.
-Row 0 looks toward +z, the centre column toward +x, columns grow toward +y:
+A map has H rows and W columns. Maps made by the program have W = 2H; maps of users may have any size. Continuous
+coordinates ``(row, column)`` run over [0, H] x [0, W]; texel (i, j) covers [i, i + 1] x [j, j + 1], with its centre at
+half-integers. Row 0 is toward +z, the centre column toward +x, and columns increase toward +y:
 
     theta = pi row / H,  phi = (2 column / W - 1) pi,  d = (sin theta cos phi, sin theta sin phi, cos theta).
 """
@@ -18,7 +18,7 @@ PI = wp.constant(wp.float32(math.pi))
 
 @wp.func
 def direction_from_latlong(row: wp.float32, column: wp.float32, height: wp.int32, width: wp.int32) -> wp.vec3:
-    """Unit direction of continuous map coordinates."""
+    """Return the unit direction of continuous map coordinates."""
     theta = PI * row / wp.float32(height)
     phi = (2.0 * column / wp.float32(width) - 1.0) * PI
     sin_theta = wp.sin(theta)
@@ -27,7 +27,7 @@ def direction_from_latlong(row: wp.float32, column: wp.float32, height: wp.int32
 
 @wp.func
 def latlong_from_direction(direction: wp.vec3, height: wp.int32, width: wp.int32) -> wp.vec2:
-    """Continuous (row, column) of a direction, which need not be unit; the poles map to phi = 0, never to NaN.
+    """Return the continuous (row, column) of a direction of any length; the poles have phi = 0, never NaN.
 
     theta comes from atan2(|xy|, z), not acos(z): exact near the poles and safe for a z of 1 + ulp.
     """
@@ -39,9 +39,9 @@ def latlong_from_direction(direction: wp.vec3, height: wp.int32, width: wp.int32
 
 @wp.func
 def texel_solid_angle(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.float32:
-    """Solid angle of any texel of a row: (cos theta0 - cos theta1) 2 pi / W.
+    """Return the solid angle of each texel of a row: (cos theta0 - cos theta1) 2 pi / W.
 
-    As a product of sines, and from the nearer pole: exact near both.
+    It is computed as a product of sines, with the angle from the nearer pole, so that it is exact near both poles.
     """
     half_step = 0.5 * PI / wp.float32(height)
     middle = wp.float32(wp.min(2 * row + 1, 2 * (height - row) - 1))
@@ -50,7 +50,10 @@ def texel_solid_angle(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.fl
 
 @wp.func
 def wrap_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int32) -> wp.vec2i:
-    """Texel of an index up to one row beyond a pole, where it is half a turn away, or any columns beyond the seam."""
+    """Return the texel of an index outside the map.
+
+    The row may lie up to one row beyond a pole, which continues half a turn away; the column may be any integer.
+    """
     r = row
     c = column
     if r < 0:
@@ -67,9 +70,9 @@ def wrap_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int3
 
 @wp.func
 def beside_in_row(row: wp.int32, x: wp.float32, height: wp.int32, width: wp.int32):
-    """Both texels beside x, in texel centres, along a row, and how far from the first to the second x lies.
+    """Return the two texels next to x in a row, and the fraction of the way from the first to the second.
 
-    A row beyond a pole is the one within, half a turn away.
+    x counts from the centre of texel 0. A row beyond a pole continues half a turn away.
     """
     r = row
     at = x
@@ -87,7 +90,7 @@ def beside_in_row(row: wp.int32, x: wp.float32, height: wp.int32, width: wp.int3
 
 @wp.func
 def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> wp.vec3:
-    """Linear sample along one row, at x in texel centres; see ``beside_in_row``."""
+    """Return the linearly interpolated radiance in one row at x; see ``beside_in_row``."""
     first, second, t = beside_in_row(row, x, radiance.shape[0], radiance.shape[1])
     a = radiance[first[0], first[1]]
     return a + t * (radiance[second[0], second[1]] - a)
@@ -95,7 +98,7 @@ def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> w
 
 @wp.func
 def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3:
-    """Bilinear sample, continuous across seam and poles for every size; exact for a constant map."""
+    """Return the bilinearly interpolated radiance of a direction: continuous across seam and poles for any size."""
     height = radiance.shape[0]
     width = radiance.shape[1]
     at = latlong_from_direction(direction, height, width)
@@ -111,7 +114,7 @@ def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3
     below_right = wp.vec2i(i + 1, j + 1)
     above = x - left
     below = above
-    # Across the border one copy of the way round, for both rows.
+    # Across the border: a loop over both rows, so that the wrapping code is compiled once.
     if i < 0 or i + 1 >= height or j < 0 or j + 1 >= width:
         part = wp.int32(0)
         while part < 2:

@@ -1,9 +1,9 @@
-"""Deterministic sample points, and lobes to draw them from.
+"""Deterministic sample points, and lobes from which directions are sampled.
 
 Local frames have the normal (or the lobe's axis) along +z. Directions ``wi``, ``wo`` and half vectors ``wh`` are unit
-and point away from the surface. A pdf is per steradian, of what its sampler returns. Sample points ``u`` lie in [0,
-1)^2. ``alpha`` is the square of the perceptual roughness; values below ``MIN_ALPHA`` act as that, so that a mirror
-stays finite.
+and point away from the surface. A pdf is per steradian, of the vector that its sampler returns. Sample points ``u`` lie
+in [0, 1)^2. ``alpha`` is the square of the perceptual roughness; smaller values are raised to ``MIN_ALPHA``, so that
+the lobe of a mirror stays finite.
 
 References:
     [JO20] Jarzynski, Olano 2020, Hash Functions for GPU Rendering: the PCG hash.
@@ -39,7 +39,7 @@ EVEN_BYTES = wp.constant(wp.uint32(0xFF00FF00))
 
 @wp.func
 def pcg3d_hash(x: wp.uint32, y: wp.uint32, z: wp.uint32) -> wp.vec3ui:
-    """Three hashes of three integers ([JO20] pcg3d), say row, column and frame."""
+    """Return three hashes of three integers, such as row, column and frame ([JO20] pcg3d)."""
     scale = wp.uint32(1664525)
     shift = wp.uint32(1013904223)
     a = x * scale + shift
@@ -59,13 +59,13 @@ def pcg3d_hash(x: wp.uint32, y: wp.uint32, z: wp.uint32) -> wp.vec3ui:
 
 @wp.func
 def uniform_from_bits(bits: wp.uint32) -> wp.float32:
-    """Number in [0, 1) from the upper 24 bits: all of them exact in float32, so 1 is never reached."""
+    """Return a number in [0, 1) from the upper 24 bits, which float32 holds exactly, so that 1 is never reached."""
     return wp.float32(bits >> wp.uint32(8)) * 5.9604644775390625e-08
 
 
 @wp.func
 def radical_inverse(index: wp.uint32) -> wp.float32:
-    """Van der Corput sequence in base 2: the bits of ``index`` mirrored about the binary point."""
+    """Return an element of the van der Corput sequence in base 2: ``index``'s bits mirrored about the point."""
     bits = index
     bits = (bits << wp.uint32(16)) | (bits >> wp.uint32(16))
     bits = ((bits & ODD_BITS) << wp.uint32(1)) | ((bits & EVEN_BITS) >> wp.uint32(1))
@@ -77,7 +77,7 @@ def radical_inverse(index: wp.uint32) -> wp.float32:
 
 @wp.func
 def hammersley(index: wp.int32, count: wp.int32) -> wp.vec2:
-    """Point ``index`` of a Hammersley set of ``count``, moved to the centres of its strata (never 0)."""
+    """Return point ``index`` of a Hammersley set of ``count`` points, moved to the centres of its strata (never 0)."""
     shift = 0.5 / wp.float32(count)
     u = (wp.float32(index) + 0.5) / wp.float32(count)
     return wp.vec2(wp.min(u, BELOW_ONE), wp.min(radical_inverse(wp.uint32(index)) + shift, BELOW_ONE))
@@ -85,7 +85,7 @@ def hammersley(index: wp.int32, count: wp.int32) -> wp.vec2:
 
 @wp.func
 def frame_from_normal(normal: wp.vec3) -> wp.mat33:
-    """Orthonormal world_from_local: columns tangent, bitangent, ``normal``; finite for every unit normal [Duff17]."""
+    """Return the rotation world_from_local for any unit normal: columns tangent, bitangent, ``normal`` [Duff17]."""
     sign = wp.float32(1.0)
     if normal[2] < 0.0:
         sign = wp.float32(-1.0)
@@ -98,7 +98,7 @@ def frame_from_normal(normal: wp.vec3) -> wp.mat33:
 
 @wp.func
 def sample_disk(u: wp.vec2) -> wp.vec2:
-    """Uniform point of the unit disk by the concentric map [SC97]: neighbours stay neighbours."""
+    """Return a uniform point of the unit disk by the concentric map [SC97], which keeps neighbours close."""
     x = 2.0 * u[0] - 1.0
     y = 2.0 * u[1] - 1.0
     if x == 0.0 and y == 0.0:
@@ -113,17 +113,17 @@ def sample_disk(u: wp.vec2) -> wp.vec2:
 
 @wp.func
 def sample_cosine_hemisphere(u: wp.vec2) -> wp.vec3:
-    """Direction with pdf cos_theta / pi (Malley's method)."""
+    """Return a direction with pdf cos_theta / pi (Malley's method)."""
     disk = sample_disk(u)
     return wp.vec3(disk[0], disk[1], wp.sqrt(wp.max(1.0 - disk[0] * disk[0] - disk[1] * disk[1], 0.0)))
 
 
 @wp.func
 def sample_phong_lobe(u: wp.vec2, exponent: wp.float32) -> wp.vec3:
-    """Direction with pdf (n + 1) / (2 pi) cos^n theta about +z.
+    """Return a direction with pdf (n + 1) / (2 pi) cos^n theta about +z.
 
-    cos theta = u^(1 / (n + 1)); its complement comes from sinh, exact for exponents of 1e5:
-    1 - e^x = -2 e^(x/2) sinh(x/2).
+    cos theta = u^(1 / (n + 1)). 1 - cos theta is computed by 1 - e^x = -2 e^(x/2) sinh(x/2), which stays exact for
+    exponents of 1e5.
     """
     x = wp.log(wp.max(1.0 - u[0], 1.0e-30)) / (exponent + 1.0)
     versine = -2.0 * wp.exp(0.5 * x) * wp.sinh(0.5 * x)
@@ -134,7 +134,7 @@ def sample_phong_lobe(u: wp.vec2, exponent: wp.float32) -> wp.vec3:
 
 @wp.func
 def phong_lobe_pdf(cos_theta: wp.float32, exponent: wp.float32) -> wp.float32:
-    """(n + 1) / (2 pi) cos^n theta, zero behind; cos^0 is 1 on the whole hemisphere."""
+    """Return the pdf (n + 1) / (2 pi) cos^n theta; zero for cos theta <= 0, also for n = 0."""
     if cos_theta <= 0.0:
         return 0.0
     return (exponent + 1.0) / (2.0 * PI) * wp.pow(wp.min(cos_theta, 1.0), exponent)
@@ -142,9 +142,9 @@ def phong_lobe_pdf(cos_theta: wp.float32, exponent: wp.float32) -> wp.float32:
 
 @wp.func
 def ggx_distribution(wh: wp.vec3, alpha: wp.float32) -> wp.float32:
-    """GGX D(wh) = a^2 / (pi (x^2 + y^2 + a^2 z^2)^2) of a local unit half vector.
+    """Return GGX D(wh) = a^2 / (pi (x^2 + y^2 + a^2 z^2)^2) of a local unit half vector.
 
-    Equal to [Walter07] eq. 33; 1 - z^2 is written as x^2 + y^2: no cancellation near the peak.
+    It equals [Walter07] eq. 33. 1 - z^2 is written as x^2 + y^2 to avoid cancellation near the peak.
     """
     a2 = wp.max(alpha, MIN_ALPHA) * wp.max(alpha, MIN_ALPHA)
     t = wh[0] * wh[0] + wh[1] * wh[1] + a2 * wh[2] * wh[2]
@@ -153,7 +153,7 @@ def ggx_distribution(wh: wp.vec3, alpha: wp.float32) -> wp.float32:
 
 @wp.func
 def ggx_lambda(w: wp.vec3, alpha: wp.float32) -> wp.float32:
-    """Smith's Lambda: (sqrt(1 + a^2 tan^2) - 1) / 2, written without cancellation for small a tan."""
+    """Return Smith's Lambda, (sqrt(1 + a^2 tan^2) - 1) / 2, without cancellation for small a tan."""
     a = wp.max(alpha, MIN_ALPHA)
     z2 = wp.max(w[2] * w[2], 1.0e-14)
     t = a * a * (w[0] * w[0] + w[1] * w[1]) / z2
@@ -162,19 +162,19 @@ def ggx_lambda(w: wp.vec3, alpha: wp.float32) -> wp.float32:
 
 @wp.func
 def ggx_masking(w: wp.vec3, alpha: wp.float32) -> wp.float32:
-    """Smith G1."""
+    """Return the Smith masking function G1."""
     return 1.0 / (1.0 + ggx_lambda(w, alpha))
 
 
 @wp.func
 def ggx_masking_shadowing(wi: wp.vec3, wo: wp.vec3, alpha: wp.float32) -> wp.float32:
-    """Height-correlated Smith G2 ([Heitz14] eq. 99)."""
+    """Return the height-correlated Smith masking-shadowing function G2 ([Heitz14] eq. 99)."""
     return 1.0 / (1.0 + ggx_lambda(wi, alpha) + ggx_lambda(wo, alpha))
 
 
 @wp.func
 def sample_ggx_visible(u: wp.vec2, wo: wp.vec3, alpha: wp.float32) -> wp.vec3:
-    """Half vector visible from ``wo`` (local, z >= 0), by a uniform spherical cap [DB23]; pdf ``ggx_visible_pdf``."""
+    """Return a half vector visible from ``wo`` (local, z >= 0) by a spherical cap [DB23]; pdf ``ggx_visible_pdf``."""
     a = wp.max(alpha, MIN_ALPHA)
     stretched = wp.normalize(wp.vec3(a * wo[0], a * wo[1], wp.max(wo[2], 1.0e-7)))
     phi = 2.0 * PI * u[0]
@@ -186,6 +186,9 @@ def sample_ggx_visible(u: wp.vec2, wo: wp.vec3, alpha: wp.float32) -> wp.vec3:
 
 @wp.func
 def ggx_visible_pdf(wh: wp.vec3, wo: wp.vec3, alpha: wp.float32) -> wp.float32:
-    """Pdf of ``sample_ggx_visible``: G1(wo) D(wh) max(wo.wh, 0) / cos_theta_o. The pdf of wi is this over 4 wo.wh."""
+    """Return the pdf of ``sample_ggx_visible``, G1(wo) D(wh) max(wo.wh, 0) / cos_theta_o.
+
+    The pdf of wi is this pdf divided by 4 wo.wh.
+    """
     cos_theta = wp.max(wo[2], 1.0e-7)
     return ggx_masking(wo, alpha) * ggx_distribution(wh, alpha) * wp.max(wp.dot(wo, wh), 0.0) / cos_theta

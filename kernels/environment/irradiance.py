@@ -1,10 +1,10 @@
-"""Irradiance of a latlong environment: what a Lambertian surface of any orientation receives.
+"""Irradiance of a latlong environment on surfaces of any orientation n.
 
     E(n) = integral of L(w) max(n.w, 0) dw;   a constant L gives E = pi L.
 
-Two forms of the result. *Spherical harmonics*: E(n) = sum_i c_i Y_i(n) with the real orthonormal basis in the order l =
-0; l = 1: y, z, x; l = 2: xy, yz, 3z^2 - 1, xz, x^2 - y^2; the cosine lobe is part of c. *Map*: a small latlong map of
-E, sampled with ``latlong.sample_latlong``.
+The result has two forms. *Spherical harmonics*: E(n) = sum_i c_i Y_i(n) with the real orthonormal basis in the order
+l = 0; l = 1: y, z, x; l = 2: xy, yz, 3z^2 - 1, xz, x^2 - y^2; the cosine lobe is part of c. *Map*: a small latlong map
+of E, sampled with ``latlong.sample_latlong``.
 
 Projection. [RH01] eq. 8: c_lm = A_l L_lm with L_lm = integral of L Y_lm and A = pi, 2 pi/3, pi/4, 0, -pi/24. A texel's
 radiance is constant, so its integral is a closed form, and a separable one: with Y_lm = N P_lm(cos theta) times cos m
@@ -13,17 +13,18 @@ phi or sin |m| phi,
     L_lm = sum over rows [integral of N P_lm(cos theta) sin theta dtheta]
            sum over columns L [integral of cos m phi dphi].
 
-The column integrals for all m are Fourier sums of a row, the row integrals one number per (row, l, |m|); both are
-tables made once, in double precision. There is no quadrature error: a constant map has no coefficient but the first.
-Sums run in a fixed order (a tile per row, then a tile per coefficient): the same input gives the same bits.
+The column integrals for all m are Fourier sums of a row, the row integrals one number per (row, l, |m|). Both are
+tables, made once in double precision. There is no quadrature error: of a constant map only the first coefficient is
+not zero. Sums run in a fixed order (a tile per row, then a tile per coefficient), so the same input gives the same
+bits.
 
-Positivity. A small emitter of flux F makes order-2 irradiance F (1/4 + x/2 + 5/32 (3 x^2 - 1)), x = cos angle: down to
--0.04 F at x = -8/15. As in [Sloan17], the coefficients are smoothed by a window with the least strength s that leaves
-no negative direction, found from the minimum; one s for the three channels, so that no hue shifts; 0 where nothing is
-negative. The mean is untouched: energy is kept. The window of [Sloan17], 1 / (1 + s l^2 (l + 1)^2), needs w_2 = 0.13
-and w_1 = 0.57 for the emitter above. Errors in (w_1, w_2) cost (1 - w_1)^2 / 12 + (1 - w_2)^2 / 51 of F^2, and along
-the border of what is positive, w_1^2 = w_2 (1/4 - 5/32 w_2) 15/2, that is least at (0.86, 0.90). The family through
-that point and the identity is taken, with the mean as its limit:
+Positivity. A small emitter of flux F has the order-2 irradiance F (1/4 + x/2 + 5/32 (3 x^2 - 1)), x = cos angle, which
+falls to -0.04 F at x = -8/15. As in [Sloan17], the coefficients are smoothed by a window with the least strength s that
+leaves no negative direction, found from the minimum of E. One s serves the three channels, so that no hue shifts; s = 0
+if E is nowhere negative. The mean is not changed, so energy is kept. The window of [Sloan17], 1 / (1 + s l^2 (l +
+1)^2), needs w_2 = 0.13 and w_1 = 0.57 for the emitter above. The window (w_1, w_2) causes the mean squared error
+(1 - w_1)^2 / 12 + (1 - w_2)^2 / 51, in F^2. On the border of positivity, w_1^2 = w_2 (1/4 - 5/32 w_2) 15/2, that error
+is least at (0.86, 0.90). The family of windows used here contains this point and the identity, and tends to the mean:
 
     w_1 = 1 / (1 + s),  w_2 = 1 / (1 + 0.7 s).
 
@@ -36,19 +37,19 @@ its eigenvectors' frame
 
     min E_s = max over mu <= w_2 min q of   c + mu - sum_i (w_1 b_i)^2 / (w_2 q_i - mu),
 
-concave in mu. The window scales the eigenvalues and does not turn the eigenvectors: one eigen-decomposition per channel
-serves the whole bisection over s. Evaluation clamps at zero what rounding leaves.
+concave in mu. The window scales the eigenvalues and keeps the eigenvectors, so one eigen-decomposition per channel
+serves the whole bisection over s. Evaluation clamps small negative values from rounding to zero.
 
-Clusters. The sum over all texels costs texels times directions. Irradiance is smooth, so nearby texels may share a
-direction: a block of texels becomes one distant light with their summed flux and their mean direction m, weighted by
-brightness. As n.w is linear in w, a block that is wholly above the horizon is exact, whatever is in it. On the horizon
-max(n.w, 0) is averaged over the block's spread: with C the covariance of its directions, n.w has the variance n'C n,
-and a box of that variance the half width h = sqrt(3 n'C n), so
+Clusters. The sum over all texels takes texels times directions terms. Irradiance is smooth, so nearby texels may share
+a direction: a block of texels becomes one distant light with their summed flux and their mean direction m, weighted by
+brightness. As n.w is linear in w, a block that lies wholly above the horizon contributes its exact irradiance. For a
+block on the horizon, max(n.w, 0) is averaged over the spread of its directions. With their covariance C, n.w has the
+variance n'C n; a box of that variance has the half width h = sqrt(3 n'C n), so
 
     mean of max(x, 0) over [c - h, c + h] = (c + h)^2 / (4 h) for |c| < h,  c = n.m.
 
-Never negative, keeps the energy, does not jump as an emitter moves. With one texel to a block this is the reference:
-the texel's own extent is in C, so that a furnace stays white at any size.
+The result is never negative, keeps the energy and does not jump as an emitter moves. Blocks of one texel are the most
+accurate form: C holds the texel's own extent, so that a white furnace stays white for maps of any size.
 
 References:
     [RH01] Ramamoorthi, Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.
@@ -69,7 +70,7 @@ from warp_ar.kernels.safe_math import safe_radiance
 wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
-BLOCK = 64  # threads that share one sum on CUDA; one on CPU
+BLOCK = 64  # threads that share one sum on CUDA; on CPU it is one thread
 WINDOW_STEPS = wp.constant(24)
 DUAL_STEPS = wp.constant(32)
 ORDER = 2
@@ -81,15 +82,15 @@ class ShTables:
     """Integrals of the basis over rows and columns of a map, on a device."""
 
     columns: wp.array2d[wp.float32]
-    """(W, 5): integral over the column of 1, cos phi, sin phi, cos 2 phi, sin 2 phi."""
+    """Integrals over each column of 1, cos phi, sin phi, cos 2 phi, sin 2 phi, (W, 5)."""
     rows: wp.array2d[wp.float32]
-    """(H, 9): A_l times the integral over the row of N P_lm(cos theta) sin theta."""
+    """A_l times the integral over each row of N P_lm(cos theta) sin theta, (H, 9)."""
     fourier: wp.array[wp.int32]
-    """(9,): which column integral a coefficient takes."""
+    """Index of the column integral of each coefficient, (9,)."""
 
 
 def cosine_lobe(l: int) -> float:
-    """A_l of the clamped cosine, [RH01] eq. 7: pi, 2 pi/3, pi/4, 0, -pi/24 ..."""
+    """Return A_l of the clamped cosine, [RH01] eq. 7: pi, 2 pi/3, pi/4, 0, -pi/24 ..."""
     if l == 1:
         return 2.0 * math.pi / 3.0
     if l % 2:
@@ -101,7 +102,9 @@ def cosine_lobe(l: int) -> float:
 
 
 def basis_row(l: int, m: int, z: np.ndarray) -> np.ndarray:
-    """N P_l|m|(z) of the real orthonormal basis without the Condon-Shortley sign, sqrt 2 of m != 0 included; float64.
+    """Return N P_l|m|(z) of the real orthonormal basis, float64, without the Condon-Shortley sign.
+
+    The factor sqrt 2 of m != 0 is part of N.
 
     Args:
         l: Degree.
@@ -115,12 +118,12 @@ def basis_row(l: int, m: int, z: np.ndarray) -> np.ndarray:
 
 
 def make_sh_tables(height: int, width: int, device: wp.DeviceLike) -> ShTables:
-    """Tables for maps of one size; made once, in double precision.
+    """Return the tables for maps of one size, computed in double precision.
 
     Args:
         height: Rows of the map.
         width: Columns of the map.
-        device: Where the tables live.
+        device: Device of the tables.
     """
     edges = (2.0 * np.arange(width + 1) / width - 1.0) * np.pi
     columns = [np.diff(edges)]
@@ -147,7 +150,7 @@ def make_sh_tables(height: int, width: int, device: wp.DeviceLike) -> ShTables:
 # Factors: sqrt(1 / 4 pi), sqrt(3 / 4 pi), and for l = 2 sqrt(15 / 4 pi), sqrt(5 / 16 pi), sqrt(15 / 16 pi).
 @wp.func
 def sum_sh2(coefficients: wp.array[wp.vec3], d: wp.vec3) -> wp.vec3:
-    """The first nine harmonics in a unit direction, weighted by their coefficients."""
+    """Return the sum of the first nine harmonics in a unit direction, weighted by their coefficients."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -160,7 +163,7 @@ def sum_sh2(coefficients: wp.array[wp.vec3], d: wp.vec3) -> wp.vec3:
 
 @wp.func
 def sh_irradiance(irradiance_sh: wp.array[wp.vec3], normal: wp.vec3) -> wp.vec3:
-    """Irradiance on a surface with unit ``normal`` from nine coefficients; never negative."""
+    """Return the irradiance on a surface with unit ``normal`` from nine coefficients, clamped to 0."""
     total = sum_sh2(irradiance_sh, normal)
     return wp.vec3(wp.max(total[0], 0.0), wp.max(total[1], 0.0), wp.max(total[2], 0.0))
 
@@ -173,7 +176,7 @@ def sum_columns_kernel(
     # Out:
     row_sums_out: wp.array2d[wp.vec3],
 ):
-    """One Fourier sum of one row, by one block."""
+    """Compute one Fourier sum of one row, by one block of threads."""
     i, k, lane = wp.tid()
     total = wp.vec3()
     for j in range(lane, environment.shape[1], wp.block_dim()):
@@ -192,7 +195,7 @@ def sum_rows_kernel(
     # Out:
     irradiance_sh_out: wp.array[wp.vec3],
 ):
-    """One coefficient, by one block."""
+    """Compute one coefficient, by one block of threads."""
     c, lane = wp.tid()
     total = wp.vec3()
     for i in range(lane, row_sums.shape[0], wp.block_dim()):
@@ -204,9 +207,9 @@ def sum_rows_kernel(
 
 @wp.func
 def sphere_minimum(q: wp.vec3, b: wp.vec3, c: wp.float32) -> wp.float32:
-    """Minimum of c + 2 b.n + sum q_i n_i^2 over unit n, through its concave dual.
+    """Return the minimum of c + 2 b.n + sum q_i n_i^2 over unit n, by bisection on the slope of its concave dual.
 
-    mu lies in [q_min - |b|, q_min]: at the lower end sum b_i^2 / (q_i - mu)^2 <= 1, the dual's slope is not negative.
+    mu lies in [q_min - |b|, q_min]: at the lower end sum b_i^2 / (q_i - mu)^2 <= 1, so the dual's slope is >= 0 there.
     """
     high = wp.min(q[0], wp.min(q[1], q[2]))
     low = high - wp.length(b)
@@ -230,19 +233,19 @@ def sphere_minimum(q: wp.vec3, b: wp.vec3, c: wp.float32) -> wp.float32:
 
 @wp.func
 def sh_window(strength: wp.float32) -> wp.vec2:
-    """Factors on the coefficients of l = 1 and l = 2."""
+    """Return the window's factors on the coefficients of l = 1 and l = 2."""
     return wp.vec2(1.0 / (1.0 + strength), 1.0 / (1.0 + 0.7 * strength))
 
 
-# n'Q n is the sum of the five terms of l = 2 on the unit sphere: half of 1.0925 c stands at each of the two places of a
-# product such as x y, and 3 z^2 - 1 is 2 z^2 - x^2 - y^2. 2 b'n is that of the three terms of l = 1. All is over the
-# mean, so that c = 1.
+# n'Q n is the sum of the five terms of l = 2 on the unit sphere: each of Q's two entries for a product such as x y is
+# 1.0925 c / 2, and 3 z^2 - 1 is written as 2 z^2 - x^2 - y^2. 2 b'n is the sum of the three terms of l = 1. All values
+# are divided by the mean, so that c = 1.
 @wp.kernel(enable_backward=False)
 def window_sh_kernel(
     # Out (and in: coefficients as projected):
     irradiance_sh_out: wp.array[wp.vec3],
 ):
-    """Smooth nine coefficients as little as keeps every direction's irradiance from being negative."""
+    """Apply the weakest window to nine coefficients that makes the irradiance of no direction negative."""
     scale = irradiance_sh_out[0] * 0.28209479  # mean irradiance; minima are compared relative to it
     strength = wp.float32(0.0)
     for channel in range(3):
@@ -262,8 +265,8 @@ def window_sh_kernel(
             b = wp.transpose(axes) * linear
             w = sh_window(strength)
             if sphere_minimum(q * w[1], b * w[0], 1.0) < 0.0:
-                # The previous channels' strength is not enough: the answer lies between it and one that leaves only the
-                # mean.
+                # The previous channels' strength is too small. Search between it and 16, where almost only the mean is
+                # left.
                 low = strength
                 high = wp.float32(16.0)
                 for _ in range(WINDOW_STEPS):
@@ -281,7 +284,7 @@ def window_sh_kernel(
 
 @wp.func
 def texel_direction(i: wp.int32, j: wp.int32, height: wp.int32, width: wp.int32) -> wp.vec3:
-    """Direction of a texel's centre."""
+    """Return the direction of a texel's centre."""
     theta = PI * (wp.float32(i) + 0.5) / wp.float32(height)
     phi = (2.0 * (wp.float32(j) + 0.5) / wp.float32(width) - 1.0) * PI
     sin_theta = wp.sin(theta)
@@ -290,12 +293,12 @@ def texel_direction(i: wp.int32, j: wp.int32, height: wp.int32, width: wp.int32)
 
 @wp.struct
 class Cluster:
-    """A block of texels as one distant light."""
+    """Distant light that stands for a block of texels."""
 
-    flux: wp.vec3  # irradiance on a surface that faces it, were it a point
+    flux: wp.vec3  # sum of radiance times solid angle
     direction: wp.vec3  # mean direction, weighted by brightness; shorter than 1
-    variance: wp.vec3  # covariance of its directions: xx, yy, zz
-    covariance: wp.vec3  # yz, xz, xy
+    variance: wp.vec3  # covariance of the block's directions: xx, yy, zz
+    covariance: wp.vec3  # covariance of the block's directions: yz, xz, xy
 
 
 # Moments of a texel's directions (r cos phi, r sin phi, z), r = sin, z = cos of the polar angle, from t0 to t1 with the
@@ -307,8 +310,8 @@ class Cluster:
 #     mean r z = (s1^3 - s0^3) / 3 / (c0 - c1)  = cos t / sin t (s0^2 + s0 s1 + s1^2) / 3
 #     mean r  = (h - sin 2h cos 2t / 2) / (c0 - c1)  = sin t cos h + (2h - sin 2h) / (4 sin t sin h).
 #
-# Over a column of half the width g about phi the mean of cos phi is sin g / g of its middle's, that of cos 2 phi is
-# sin 2g / 2g of its middle's; cos^2 phi = (1 + cos 2 phi) / 2 and cos phi sin phi = sin 2 phi / 2.
+# Over a column of half width g, the mean of cos phi is sin g / g times its value in the middle, and the mean of
+# cos 2 phi is sin 2g / 2g times its value there; cos^2 phi = (1 + cos 2 phi) / 2, cos phi sin phi = sin 2 phi / 2.
 @wp.kernel(enable_backward=False)
 def gather_clusters_kernel(
     row_start: wp.int32,
@@ -318,7 +321,7 @@ def gather_clusters_kernel(
     # Out:
     clusters_out: wp.array[Cluster],
 ):
-    """One block of texels as one distant light."""
+    """Write the distant light of one block of texels."""
     bi, bj = wp.tid()
     bi += row_start
     height = environment.shape[0]
@@ -332,7 +335,7 @@ def gather_clusters_kernel(
     half_column = PI / wp.float32(width)
     sin_half = wp.sin(half_step)
     cos_half = wp.cos(half_step)
-    # 2 half_step - sin(2 half_step), as a series where the difference would cancel.
+    # 2 half_step - sin(2 half_step), by its series for small steps, where the difference would cancel.
     step = 2.0 * half_step
     arc_excess = step - wp.sin(step)
     if step < 0.5:
@@ -380,10 +383,10 @@ def gather_clusters_kernel(
     clusters_out[bi * blocks[1] + bj] = cluster
 
 
-# n'C n is at most C's trace, so that h is at most sqrt(3 trace): where |c| is more, no product with C is needed.
+# n'C n is at most the trace of C, so h is at most sqrt(3 trace). For larger |c| no product with C is needed.
 @wp.func
 def cluster_cosine(cluster: Cluster, normal: wp.vec3) -> wp.float32:
-    """Mean of max(n.w, 0) over a cluster: exact above the horizon, a box of the same variance on it."""
+    """Return the mean of max(n.w, 0) over a cluster: exact above the horizon, by a box of equal variance on it."""
     cosine = wp.dot(cluster.direction, normal)
     total = wp.max(cluster.variance[0] + cluster.variance[1] + cluster.variance[2], 1.0e-8)
     if cosine * cosine >= 3.0 * total:
@@ -406,12 +409,12 @@ def sum_clusters_kernel(
     # Out:
     irradiance_map_out: wp.array2d[wp.vec3],
 ):
-    """Irradiance of one direction from all clusters, by one block."""
+    """Sum the irradiance of one direction over all clusters, by one block of threads."""
     i, j, lane = wp.tid()
     i += row_start
     normal = texel_direction(i, j, irradiance_map_out.shape[0], irradiance_map_out.shape[1])
     total = wp.vec3()
-    # Sums of sums: float32 stays within 1e-5 over 100,000 terms.
+    # Partial sums of 256 terms keep the error of float32 within 1e-5 over 100,000 terms.
     part = wp.vec3()
     count = wp.int32(0)
     for k in range(lane, clusters.shape[0], wp.block_dim()):
@@ -432,13 +435,13 @@ def project_irradiance_sh(
     row_sums_out: wp.array2d[wp.vec3],
     irradiance_sh_out: wp.array[wp.vec3],
 ) -> None:
-    """Irradiance coefficients of a map: exact integrals of its texels, cosine lobe included, no window.
+    """Write the irradiance coefficients of a map: exact integrals over its texels with the cosine lobe, no window.
 
     Args:
-        environment: (H, W) radiance.
-        tables: Of the same size.
-        row_sums_out: (H, 5) scratch.
-        irradiance_sh_out: (9,).
+        environment: Radiance, (H, W).
+        tables: Tables for maps of this size.
+        row_sums_out: Temporary array, (H, 5).
+        irradiance_sh_out: Coefficients, (9,).
     """
     launch_tiles(sum_columns_kernel, row_sums_out.shape, [environment, tables.columns], [row_sums_out], block_dim=BLOCK)
     launch_tiles(
@@ -451,28 +454,28 @@ def project_irradiance_sh(
 
 
 def window_sh(irradiance_sh_out: wp.array[wp.vec3]) -> None:
-    """Window nine coefficients, (9,), in place, as little as keeps irradiance from being negative anywhere."""
+    """Apply the weakest window to nine coefficients, (9,), in place, that makes irradiance nowhere negative."""
     launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out])
 
 
 gather_clusters = row_launcher(gather_clusters_kernel, like=lambda environment, blocks, clusters: blocks)
-"""Distant lights that stand for blocks of texels; blocks of one texel make the reference.
+"""Write the distant lights that stand for blocks of texels.
 
 Args:
-    environment: (H, W) radiance.
-    blocks: Blocks along rows and columns, at most (H, W).
-    clusters_out: (blocks[0] blocks[1],).
+    environment: Radiance, (H, W).
+    blocks: Numbers of blocks along rows and columns, at most (H, W).
+    clusters_out: Distant lights, (blocks[0] blocks[1],).
 """
 
 
 def sum_clusters(
     clusters: wp.array[Cluster], irradiance_map_out: wp.array2d[wp.vec3], *, rows: Rows | None = None
 ) -> None:
-    """Map of irradiance from distant lights.
+    """Write a latlong map of the irradiance from distant lights.
 
     Args:
-        clusters: (N,) as ``gather_clusters`` writes.
-        irradiance_map_out: (h, w).
+        clusters: Distant lights as written by ``gather_clusters``, (N,).
+        irradiance_map_out: Irradiance, (h, w).
         rows: Band of the map's rows; None means all.
     """
     launch_tiles(

@@ -1,13 +1,13 @@
-"""Lobes of glossy reflection: their widths, where their maps lie in memory, and their shapes in numbers.
+"""Lobes of glossy reflection: their widths, the layout of their maps in memory, and their tables of weights.
 
 Levels. Level 0 is the environment itself (a mirror). Level l >= 1 holds the environment averaged with a lobe of width
 
     alpha_l = 2^(l - L),  l = 1 .. L,
 
-L such that the narrowest is about three texels of the map wide (full width at half maximum). A wider lobe needs fewer
-texels: level l has (H >> s, 2 H >> s) with s = max(l - 2, 0), which leaves eight texels per unit of alpha, bilinear
-error below 2 % of a single emitter's peak. All levels lie in one packed ``wp.array[wp.vec3]``, row-major, one after
-another. ``kernels/environment/prefilter.py`` fills them, ``sample_levels`` reads them.
+where L is such that the narrowest lobe is about three texels of the map wide (full width at half maximum). A wider lobe
+needs fewer texels: level l has (H >> s, 2 H >> s) texels with s = max(l - 2, 0), which keeps the bilinear error below
+2 % of a single emitter's peak. All levels lie in one packed ``wp.array[wp.vec3]``, row-major, one after another.
+``kernels/environment/prefilter.py`` fills them, ``sample_levels`` reads them.
 
 References:
     [KC08] Krivanek, Colbert 2008, Real-time Shading with Filtered Importance Sampling.
@@ -29,52 +29,52 @@ from warp_ar.kernels.latlong import latlong_from_direction
 
 wp.set_module_options({"enable_backward": False})
 
-# How much coarser a level of the pyramid is read than the bare share of a sample asks for: samples then overlap, as
-# [KC08] advise. Between 0, best for smooth skies, and 0.5, best for small emitters, by error against brute force.
+# Added to the pyramid level whose texel has a sample's solid angle, so that samples overlap, as [KC08] advise. By error
+# against brute force, 0 is best for smooth skies and 0.5 for small emitters; this value is a compromise.
 SAMPLE_BIAS = 0.25
 Lobe = Literal["ggx", "phong"]
 
 
 def lobe_count(height: int) -> int:
-    """Levels of a prefiltered environment of ``height`` rows, the mirror among them."""
+    """Return the number of levels of a prefiltered environment of ``height`` rows, the mirror included."""
     return 1 + max(1, (height >> 2).bit_length())
 
 
 def lobe_size(height: int, level: int) -> tuple[int, int]:
-    """Rows and columns of a level."""
+    """Return the rows and columns of a level."""
     shift = max(level - 2, 0)
     return height >> shift, 2 * height >> shift
 
 
 def lobe_offset(height: int, level: int) -> int:
-    """Index of a level's first texel."""
+    """Return the index of a level's first texel."""
     return sum(rows * columns for rows, columns in (lobe_size(height, below) for below in range(level)))
 
 
 def lobe_texels(height: int) -> int:
-    """Texels of all levels together: the length of ``prefilter_levels``."""
+    """Return the number of texels of all levels: the length of the array ``prefilter_levels``."""
     return lobe_offset(height, lobe_count(height))
 
 
 def lobe_alpha(height: int, level: int) -> float:
-    """Width alpha of a level's lobe; 0 for the mirror."""
+    """Return the width alpha of a level's lobe; 0 for the mirror."""
     return 0.0 if level == 0 else 2.0 ** (level - (lobe_count(height) - 1))
 
 
 @wp.func
 def last_lobe(height: wp.int32) -> wp.int32:
-    """Index L of the widest lobe's level."""
+    """Return the index L of the level with the widest lobe."""
     last = wp.int32(1)
     while (height >> (last + 2)) > 0:
         last += 1
     return last
 
 
-# Between levels, the level is linear in log2 alpha: that lies between the blend with the least squared error and the
-# one with the best encircled energy, for both lobes and all widths.
+# Between levels, the level is linear in log2 alpha. For both lobes and all widths this lies between the blend with the
+# least squared error and the blend with the best encircled energy.
 @wp.func
 def level_from_alpha(alpha: wp.float32, height: wp.int32) -> wp.float32:
-    """Level, with fraction, of a lobe of width ``alpha``; below the narrowest, a share of it proportional to alpha."""
+    """Return the fractional level of a lobe of width ``alpha``; below level 1 the level is proportional to alpha."""
     last = last_lobe(height)
     narrowest = 2.0 / wp.float32(1 << last)
     if alpha < narrowest:
@@ -84,24 +84,24 @@ def level_from_alpha(alpha: wp.float32, height: wp.int32) -> wp.float32:
 
 @wp.func
 def level_from_roughness(roughness: wp.float32, height: wp.int32) -> wp.float32:
-    """Level of a perceptual roughness (glTF): alpha is its square."""
+    """Return the level of a perceptual roughness as in glTF, whose square is alpha."""
     return level_from_alpha(roughness * roughness, height)
 
 
 @wp.func
 def level_from_shininess(shininess: wp.float32, height: wp.int32) -> wp.float32:
-    """Level of a Phong exponent: alpha = 1 / sqrt n; 1 and below are the widest lobe."""
+    """Return the level of a Phong exponent n: alpha = 1 / sqrt n; n <= 1 gives the widest lobe."""
     return level_from_alpha(1.0 / wp.sqrt(wp.max(shininess, 1.0)), height)
 
 
 @wp.func
 def sample_levels(levels: wp.array[wp.vec3], direction: wp.vec3, level: wp.float32, height: wp.int32) -> wp.vec3:
-    """Radiance reflected from ``direction``, blended between the two nearest levels; seam and poles are safe.
+    """Return the radiance reflected from ``direction``, blended between the two nearest levels.
 
     Args:
         levels: Packed levels, (lobe_texels(height),).
         direction: Mirror direction, world; need not be unit.
-        level: From ``level_from_roughness`` or ``level_from_shininess``; clamped to those that exist.
+        level: Level from ``level_from_roughness`` or ``level_from_shininess``, clamped to the existing levels.
         height: Rows of level 0.
     """
     last = last_lobe(height)
@@ -128,7 +128,7 @@ def sample_levels(levels: wp.array[wp.vec3], direction: wp.vec3, level: wp.float
 
 @wp.func
 def locate_texel(index: wp.int32, height: wp.int32) -> wp.vec4i:
-    """(level, row, column, first index of the level) of a packed texel."""
+    """Return (level, row, column, index of the level's first texel) of a packed texel."""
     level = wp.int32(0)
     offset = wp.int32(0)
     w = 2 * height
@@ -142,16 +142,16 @@ def locate_texel(index: wp.int32, height: wp.int32) -> wp.vec4i:
     return wp.vec4i(level, i, index - offset - i * w, offset)
 
 
-# Lobes, about the mirror direction R, cos theta = R.w, each normalised by its own sum so that a constant environment
-# stays constant:
+# Lobes about the mirror direction R, c = cos theta = R.w. Each is normalised by its own sum, so that a constant
+# environment stays constant:
 #
-#     GGX with N = V = R, as split-sum shading takes it [Karis13], alpha = roughness^2, c = cos theta:
+#     GGX with N = V = R, as in split-sum shading [Karis13], alpha = roughness^2:
 #     D(half vector) c ~ c / ((1 - c) / 2 + alpha^2 (1 + c) / 2)^2.
 #     At alpha = 1 it is the plain cosine: roughness 1 reflects irradiance / pi.
-#     Phong:  cos^n theta with n = 1 / alpha^2. At alpha = 1 it is the plain cosine as well; exponents below 1 act as 1.
-#     The variance per axis of a narrow Phong lobe is 1 / n = alpha^2: both lobes are about as wide at equal alpha.
+#     Phong:  cos^n theta with n = 1 / alpha^2. At alpha = 1 it is the plain cosine too; exponents below 1 act as 1.
+#     The variance per axis of a narrow Phong lobe is 1 / n = alpha^2, so both lobes are about equally wide.
 def lobe_kernel(cos_theta: np.ndarray, alpha: float, lobe: Lobe) -> np.ndarray:
-    """Lobe before normalisation, float64.
+    """Return the values of a lobe before normalisation, float64.
 
     Args:
         cos_theta: Cosine of the angle to the mirror direction.
@@ -164,20 +164,19 @@ def lobe_kernel(cos_theta: np.ndarray, alpha: float, lobe: Lobe) -> np.ndarray:
     return c / (0.5 * (1.0 - cos_theta) + 0.5 * alpha**2 * (1.0 + cos_theta)) ** 2
 
 
-# Mixed mips: level l is a sum of several levels m of an isotropic pyramid [MS16], sum_m w_lm mip_m with w >= 0 and sum
-# w
-# = 1, each read through quadratic B-splines. A box mip read so blurs with variance sigma_m^2 = (T_m^2 - T_0^2) / 12 +
-# T_m^2 / 4 per axis, T_m = pi / H_m: the box and the spline; mip 0 is read as it is. On the sphere that is close to
-# exp(-k (k + 1) sigma_m^2 / 2) in degree k. The weights minimise the expected squared error
+# Mixed mips: level l is a weighted sum of levels m of an isotropic pyramid [MS16], sum_m w_lm mip_m with w >= 0 and
+# sum w = 1, each read through quadratic B-splines. Box and spline of mip m together blur with the variance
+# sigma_m^2 = (T_m^2 - T_0^2) / 12 + T_m^2 / 4 per axis, T_m = pi / H_m; mip 0 is read without a spline. On the sphere
+# this attenuates degree k by about B_mk = exp(-k (k + 1) sigma_m^2 / 2). The weights minimise the expected error
 #
 #     sum_k (2 k + 1) S_k (K_k - sum_m w_lm B_mk)^2,   S_k = 1 / (k + 1/2)^2,
 #
-# K_k the lobe's zonal coefficients (K_0 = 1) and S_k the power per coefficient of natural scenes. A single level with
-# the lobe's second moment would do for Phong; GGX has tails so long that its moment grows without bound as alpha falls,
-# and a single box cannot have peak and tails.
+# with the lobe's zonal coefficients K_k (K_0 = 1) and the power S_k per coefficient of natural scenes. For Phong a
+# single level with the lobe's second moment would suffice. GGX has long tails, whose second moment exceeds alpha^2 by
+# more and more as alpha falls, and no single box has both its peak and its tails.
 @functools.lru_cache(maxsize=4)
 def mip_weights(height: int, lobe: Lobe) -> np.ndarray:
-    """Weights w_lm of box mips m (columns) that make the lobe of level l (rows), as derived above; row 0 is the mirror.
+    """Return the weights w_lm of mips m (columns) that approximate the lobe of level l (rows); row 0 is the mirror.
 
     Args:
         height: Rows of the environment; it has twice as many columns.
@@ -185,7 +184,7 @@ def mip_weights(height: int, lobe: Lobe) -> np.ndarray:
     """
     mips, count = level_count(height, 2 * height), lobe_count(height)
     nodes = (np.arange(2048) + 0.5) / 2048
-    theta = 0.5 * np.pi * nodes**2  # midpoints that gather at the peak
+    theta = 0.5 * np.pi * nodes**2  # midpoints, denser near the peak
     measure = np.sin(theta) * nodes
     degrees = 4 * height
     cosine = np.cos(theta)
@@ -209,7 +208,10 @@ def mip_weights(height: int, lobe: Lobe) -> np.ndarray:
 
 
 def _simplex_least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Least squares over weights that are not negative and sum to 1: drop the most negative weight, solve again."""
+    """Return the least-squares weights that are not negative and sum to 1.
+
+    While the solution has a negative weight, the most negative one is set to 0 and the rest is solved again.
+    """
     active = list(range(matrix.shape[1]))
     while True:
         columns = matrix[:, active]
@@ -226,28 +228,28 @@ def _simplex_least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray
 
 @dataclasses.dataclass(frozen=True)
 class LobeSamples:
-    """Directions drawn from the lobe of every level, on a device."""
+    """Directions sampled from the lobe of every level, on a device."""
 
     directions: wp.array2d[wp.vec4]
-    """(levels, S): local direction, the lobe's axis along +z, and the level of the pyramid to read."""
+    """Local direction (xyz, lobe's axis along +z) and pyramid level to read (w), (levels, S)."""
     weights: wp.array2d[wp.float32]
-    """(levels, S): weight of each; those of a level sum to 1."""
+    """Weight of each direction, (levels, S); the weights of a level sum to 1."""
 
 
-# Filtered importance sampling [KC08]: S directions drawn from the lobe, each read from the level of an isotropic
-# pyramid whose texel covers the direction's share 1 / (S pdf) of the sphere: m = log2(share / T_0^2) / 2 + bias.
-# GGX is that of a surface seen from straight ahead, its normal the axis: half vectors are drawn by D cos, which gives
-# cos^2 = (1 - u) / (1 - u + alpha^2 u), directions then have pdf D / 4, and count by n.l [Karis13].
-# Directions are a Hammersley set in the frame of theta and phi, the same for every texel of a level: no noise between
-# neighbours, no flicker between frames.
+# Filtered importance sampling [KC08]: S directions are sampled from the lobe. Each is read from the level of an
+# isotropic pyramid whose texel covers its share 1 / (S pdf) of the sphere: m = log2(share / T_0^2) / 2 + bias.
+# The GGX lobe is that of a surface viewed along its normal. Half vectors are sampled by D cos, which gives
+# cos^2 = (1 - u) / (1 - u + alpha^2 u); the directions then have the pdf D / 4 and the weight n.l [Karis13].
+# The same Hammersley set of directions serves every texel of a level: no noise between neighbours, no flicker between
+# frames.
 def make_lobe_samples(height: int, lobe: Lobe, count: int, device: wp.DeviceLike) -> LobeSamples:
-    """Draw ``count`` directions for every level; level 0 gets the mirror direction.
+    """Sample ``count`` directions for every level; level 0 gets the mirror direction.
 
     Args:
         height: Rows of the environment; it has twice as many columns.
         lobe: ``ggx`` or ``phong``.
         count: Samples per texel.
-        device: Where the samples live.
+        device: Device of the samples.
     """
     levels = lobe_count(height)
     index = np.arange(count)
@@ -271,7 +273,7 @@ def make_lobe_samples(height: int, lobe: Lobe, count: int, device: wp.DeviceLike
         directions[level, :, 0] = sine * np.cos(2.0 * np.pi * v)
         directions[level, :, 1] = sine * np.sin(2.0 * np.pi * v)
         directions[level, :, 2] = cosine
-        # A few directions do not balance: turned until their mean lies on the axis, or reflections would be shifted.
+        # The mean of a few directions is off the axis, which would shift reflections: move the mean onto the axis.
         for _ in range(16):
             mean = weights[level] @ directions[level, :, :3]
             directions[level, :, :2] -= mean[:2] / mean[2] * directions[level, :, 2:3]
@@ -285,5 +287,5 @@ def make_lobe_samples(height: int, lobe: Lobe, count: int, device: wp.DeviceLike
 
 
 def lobe_rows(height: int) -> int:
-    """Rows of all levels together."""
+    """Return the number of rows of all levels."""
     return sum(lobe_size(height, level)[0] for level in range(lobe_count(height)))

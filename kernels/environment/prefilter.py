@@ -1,17 +1,16 @@
-"""Glossy reflections of a latlong environment: one map per lobe, from mirror to the widest, for a shader to blend.
+"""Glossy reflections of a latlong environment: one map per lobe, from the mirror to the widest lobe.
 
-``kernels/environment/lobes.py`` says which lobes there are and where their maps lie; ``kernels/split_sum.py`` has the
-other factor
-of the split sum. Ways to fill the levels, cheapest first:
+``kernels/environment/lobes.py`` defines the lobes and the layout of their maps (levels); ``kernels/split_sum.py`` holds
+the other factor of the split sum. Three methods fill the levels, cheapest first:
 
-Mixed mips (``mix_mips``): level l is a sum of several levels of an isotropic pyramid, each read
-through quadratic B-splines, then scaled, per channel, to hold exactly the energy of the environment.
+Mixed mips (``mix_mips``): level l is a weighted sum of levels of an isotropic pyramid, each read through quadratic
+B-splines. It is then scaled, per channel, to the energy of the environment.
 
-Filtered importance sampling (``sample_lobes``) [KC08]: directions drawn from the lobe, each read from a level of an
-isotropic pyramid. Scaled to the energy as above.
+Filtered importance sampling (``sample_lobes``) [KC08]: directions are sampled from the lobe, and each is read from a
+level of an isotropic pyramid. The result is scaled as above.
 
-Brute force (``integrate_lobes``): every texel of the environment weighted by its solid angle and the lobe. The
-reference.
+Brute force (``integrate_lobes``): every texel of the environment is weighted by its solid angle and the lobe. This is
+the most accurate method.
 
 References:
     [AG02] Ashikhmin, Ghosh 2002, Simple Blurry Reflections with Environment Maps.
@@ -35,7 +34,7 @@ wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
 BLOCK = 64
-# An energy correction beyond this factor would be a fault, not a correction.
+# Largest factor of the energy correction; a larger one would indicate a fault.
 MAX_CORRECTION = wp.constant(wp.float32(4.0))
 
 
@@ -49,7 +48,7 @@ def mix_mips_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """One packed texel from the levels of a pyramid; no trigonometry is needed."""
+    """Compute one packed texel as a weighted sum of a pyramid's levels."""
     index = wp.tid() + row_start
     at = locate_texel(index, height)
     level = at[0]
@@ -83,7 +82,7 @@ def sample_lobes_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """One packed texel by filtered importance sampling."""
+    """Compute one packed texel by filtered importance sampling."""
     index = wp.tid() + row_start
     at = locate_texel(index, height)
     level = at[0]
@@ -93,8 +92,8 @@ def sample_lobes_kernel(
     h = height >> wp.max(level - 2, 0)
     w = 2 * height >> wp.max(level - 2, 0)
     last = last_mip(height, 2 * height)
-    # By symmetry about z a texel's samples are those of longitude 0, turned by the texel's own: its column is added to
-    # theirs.
+    # By symmetry about z, a texel's samples are the samples of longitude 0 rotated by the texel's longitude: its column
+    # is added to theirs.
     theta = PI * (wp.float32(at[1]) + 0.5) / wp.float32(h)
     sin_theta = wp.sin(theta)
     cos_theta = wp.cos(theta)
@@ -113,12 +112,12 @@ def sample_lobes_kernel(
     levels_out[index] = total
 
 
-# The lobe of GGX is that of a surface seen from straight ahead, as [Karis13] has it, weighted by n.l: for light at the
-# angle w from the axis the half vector stands at w / 2, with sin^2 = (1 - cos w) / 2 and cos^2 = (1 + cos w) / 2, so
+# The GGX lobe is that of a surface viewed along its normal, weighted by n.l [Karis13]. For light at the angle w from
+# the axis, the half vector is at w / 2, with sin^2 = (1 - cos w) / 2 and cos^2 = (1 + cos w) / 2, so
 #
 #     weight ~ cos w D(w / 2) ~ cos w alpha^4 / (sin^2 + alpha^2 cos^2)^2.
 #
-# That of Phong is cos^n w with n = 1 / alpha^2: near the axis D and cos^n both fall as 1 - w^2 / (2 alpha^2).
+# The Phong lobe is cos^n w with n = 1 / alpha^2; near the axis both lobes fall as 1 - w^2 / (2 alpha^2).
 @wp.kernel(enable_backward=False)
 def integrate_lobes_kernel(
     row_start: wp.int32,
@@ -128,7 +127,7 @@ def integrate_lobes_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """One packed texel from every texel of the environment."""
+    """Compute one packed texel from all texels of the environment."""
     index = wp.tid() + row_start
     height = environment.shape[0]
     width = environment.shape[1]
@@ -147,8 +146,8 @@ def integrate_lobes_kernel(
     total_weight = wp.float32(0.0)
     for i in range(height):
         source_theta = PI * (wp.float32(i) + 0.5) / wp.float32(height)
-        # 1 - cos of the angle between = 2 (sin^2(dtheta / 2) + sin sin sin^2(dphi / 2)): no cancellation in narrow
-        # lobes.
+        # 1 - cos of the angle between two directions is 2 (sin^2(dtheta / 2) + sin theta sin theta' sin^2(dphi / 2)),
+        # without cancellation in narrow lobes.
         across = wp.sin(0.5 * (source_theta - theta))
         around = sin_theta * wp.sin(source_theta)
         row_total = wp.vec3()
@@ -174,7 +173,7 @@ def integrate_lobes_kernel(
 
 @wp.func
 def locate_row(row: wp.int32, height: wp.int32) -> wp.vec4i:
-    """(level, row of the level, index of its first texel, 0) of the packed rows, counted through all levels."""
+    """Return (level, row in the level, index of the row's first texel, 0) of a row counted through all levels."""
     level = wp.int32(0)
     first = wp.int32(0)
     offset = wp.int32(0)
@@ -195,7 +194,7 @@ def sum_level_rows_kernel(
     # Out:
     row_energy_out: wp.array[wp.vec3],
 ):
-    """Energy of one row of one level, by one block."""
+    """Compute the energy of one row of one level, by one block of threads."""
     row, lane = wp.tid()
     at = locate_row(row, height)
     h = height >> wp.max(at[0] - 2, 0)
@@ -216,7 +215,7 @@ def sum_levels_kernel(
     # Out:
     energy_out: wp.array[wp.vec3],
 ):
-    """Energy of one level, by one block."""
+    """Compute the energy of one level, by one block of threads."""
     level, lane = wp.tid()
     first = wp.int32(0)
     for l in range(level):
@@ -238,7 +237,7 @@ def scale_levels_kernel(
     # Out (and in: levels as filtered):
     levels_out: wp.array[wp.vec3],
 ):
-    """Scale every level to the energy of level 0."""
+    """Scale one packed texel by the factor that gives its level the energy of level 0."""
     index = wp.tid() + row_start
     level = locate_texel(index, height)[0]
     if level > 0:
@@ -254,9 +253,9 @@ mix_mips = row_launcher(mix_mips_kernel)
 
 Args:
     pyramid: Pyramid of the (height, 2 height) environment, see ``pyramid.build_pyramid``.
-    weights: (levels, mips) of ``mip_weights``.
+    weights: Weights of ``mip_weights``, (levels, mips).
     height: Rows of the environment.
-    levels_out: (lobe_texels(height),).
+    levels_out: Packed levels, (lobe_texels(height),).
 """
 
 
@@ -265,32 +264,33 @@ sample_lobes = row_launcher(sample_lobes_kernel)
 
 Args:
     pyramid: Isotropic pyramid of the (height, 2 height) environment.
-    samples: For the same height.
+    directions: Directions of ``make_lobe_samples`` for this height, (levels, S).
+    weights: Weights of ``make_lobe_samples`` for this height, (levels, S).
     height: Rows of the environment.
-    levels_out: (lobe_texels(height),).
+    levels_out: Packed levels, (lobe_texels(height),).
 """
 
 
 integrate_lobes = row_launcher(integrate_lobes_kernel)
-"""Fill all levels by summing over the whole environment: the reference.
+"""Fill all levels by brute force, summing over the whole environment.
 
 Args:
-    environment: (H, 2 H) radiance.
-    phong: Whether lobes are those of ``phong``, else of ``ggx``.
-    levels_out: (lobe_texels(H),).
+    environment: Radiance, (H, 2 H).
+    phong: True for Phong lobes, False for GGX lobes.
+    levels_out: Packed levels, (lobe_texels(H),).
 """
 
 
 def measure_energy(
     levels: wp.array[wp.vec3], height: int, row_energy_out: wp.array[wp.vec3], energy_out: wp.array[wp.vec3]
 ) -> None:
-    """Energy of every level: the integral of radiance over the sphere, summed in a fixed order.
+    """Write the energy of every level: the integral of radiance over the sphere, summed in a fixed order.
 
     Args:
-        levels: (lobe_texels(height),).
+        levels: Packed levels, (lobe_texels(height),).
         height: Rows of the environment.
-        row_energy_out: (lobe_rows(height),) scratch.
-        energy_out: (lobe_count(height),).
+        row_energy_out: Temporary array, (lobe_rows(height),).
+        energy_out: Energy of each level, (lobe_count(height),).
     """
     launch_tiles(sum_level_rows_kernel, row_energy_out.shape, [levels, height], [row_energy_out], block_dim=BLOCK)
     launch_tiles(sum_levels_kernel, energy_out.shape, [row_energy_out, height], [energy_out], block_dim=BLOCK)
@@ -300,7 +300,7 @@ scale_levels = row_launcher(scale_levels_kernel)
 """Scale every level, in place, to the energy of level 0.
 
 Args:
-    energy: As ``measure_energy`` writes.
+    energy: Energy of each level as written by ``measure_energy``.
     height: Rows of the environment.
-    levels_out: (lobe_texels(height),).
+    levels_out: Packed levels, (lobe_texels(height),).
 """

@@ -1,22 +1,22 @@
-"""Isotropic pyramids of latlong maps: levels hold mean radiances over solid angles, about as wide as high.
+"""Isotropic pyramids of latlong maps: texels hold mean radiance over footprints that are about as wide as high.
 
 A pyramid is one packed ``wp.array[wp.vec3]``: level l has (max(H >> l, 1), max(W >> l, 1)) texels in row-major order
-and follows the levels before it; there are ``level_count(H, W)``, down to one row or column. Level 0 is the map itself,
-made safe: see ``safe_radiance``.
+and follows the levels before it. There are ``level_count(H, W)`` levels, down to one row or column. Level 0 is the map
+itself after ``safe_radiance``.
 
-A texel of level l is the mean of level l - 1 over the area that it covers. Sizes need not be even: the overlap of
-texels is counted in integers (texel i of h spans [i H, (i + 1) H] where texel r of H spans [r h, (r + 1) h]), its solid
-angle is a product
+A texel of level l is the mean of level l - 1 over the area that it covers. Sizes need not be even: overlaps of texels
+are computed in integers (texel i of h spans [i H, (i + 1) H] where texel r of H spans [r h, (r + 1) h]). The solid
+angle of an overlap is
 
     (phi1 - phi0) (cos theta0 - cos theta1),
     cos theta0 - cos theta1 = 2 sin((theta0 + theta1) / 2) sin((theta1 - theta0) / 2).
 
 So every level keeps the energy.
 
-Columns are counted over a wider span, so that a footprint is as wide as high: near the poles a texel of a latlong map
-is much narrower than high, and a box of texels would blur along meridians only. There a texel averages over
-W' / (w sin theta) columns instead of W' / w, at most over all of them. Rows are blurred around the axis only, which
-moves no energy from row to row: energy is still kept.
+Near the poles a texel of a latlong map is much narrower than high, and a box of texels would blur along meridians only.
+To make footprints as wide as high, a texel averages over W' / (w sin theta) columns of the level before it instead of
+W' / w, at most over all of them. This additional blur acts within rows, so it moves no energy between rows, and energy
+is still kept.
 
 References:
     [AG02] Ashikhmin, Ghosh 2002, Simple Blurry Reflections with Environment Maps.
@@ -38,22 +38,22 @@ PI = wp.constant(wp.float32(math.pi))
 
 
 def level_size(height: int, width: int, level: int) -> tuple[int, int]:
-    """Rows and columns of a level."""
+    """Return the rows and columns of a level."""
     return max(height >> level, 1), max(width >> level, 1)
 
 
 def level_count(height: int, width: int) -> int:
-    """Levels of a pyramid, the map itself among them: the last has one row or one column."""
+    """Return the number of levels, the map itself included; the last has one row or one column."""
     return min(height, width).bit_length()
 
 
 def level_offset(height: int, width: int, level: int) -> int:
-    """Index of a level's first texel in the packed array."""
+    """Return the index of a level's first texel in the packed array."""
     return sum(rows * columns for rows, columns in (level_size(height, width, below) for below in range(level)))
 
 
 def packed_texels(height: int, width: int) -> int:
-    """Texels of a whole pyramid."""
+    """Return the number of texels of a pyramid."""
     return level_offset(height, width, level_count(height, width))
 
 
@@ -61,14 +61,15 @@ def packed_texels(height: int, width: int) -> int:
 def sample_packed(
     levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.float32, column: wp.float32
 ):
-    """Bilinear sample of one packed level at continuous coordinates, across the seam and the poles."""
+    """Return the bilinear sample of one packed level at continuous coordinates, across seam and poles."""
     y = row - 0.5
     x = column - 0.5
     i = wp.int32(wp.floor(y))
     j = wp.int32(wp.floor(x))
     fy = y - wp.float32(i)
     fx = x - wp.float32(j)
-    # Texels' places first, then one copy of what is read and mixed; across the border one copy of the way round, too.
+    # The places of the four texels come first, so that the code that reads and mixes them is compiled once. A loop for
+    # texels across the border has the same reason.
     above_left = offset + i * width + j
     above_right = above_left + 1
     below_left = above_left + width
@@ -96,10 +97,10 @@ def sample_packed(
 def sample_packed_smooth(
     levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.float32, column: wp.float32
 ):
-    """Sample of one packed level through quadratic B-splines: shows no blocks.
+    """Return the sample of one packed level through quadratic B-splines, which hide the texel grid.
 
-    Nine texels, per axis (1/2 - t)^2 / 2, 3/4 - t^2, (1/2 + t)^2 / 2 at offset t from the nearest centre; the variance
-    that this adds is a quarter of a texel's width squared, per axis.
+    Nine texels have the weights (1/2 - t)^2 / 2, 3/4 - t^2, (1/2 + t)^2 / 2 per axis at offset t from the nearest
+    centre. Per axis this adds a variance of a quarter of a squared texel width.
     """
     i = wp.int32(wp.floor(row))
     j = wp.int32(wp.floor(column))
@@ -136,7 +137,7 @@ def sample_packed_smooth(
 
 @wp.func
 def last_mip(height: wp.int32, width: wp.int32) -> wp.int32:
-    """Number of the last level of a pyramid."""
+    """Return the index of the last level of a pyramid."""
     size = wp.min(height, width)
     last = wp.int32(0)
     while (size >> (last + 1)) > 0:
@@ -154,14 +155,14 @@ def sample_mips(
     height: wp.int32,
     width: wp.int32,
 ) -> wp.vec3:
-    """Trilinear sample of the pyramid of a (height, width) map.
+    """Return the trilinear sample of the pyramid of a (height, width) map.
 
     Args:
         levels: Packed levels.
-        v: Row over the map's height.
-        u: Column over the map's width.
-        level: With its fraction; clamped to those that exist.
-        last: From ``last_mip``: asked for once where many samples are taken.
+        v: Row divided by the map's height.
+        u: Column divided by the map's width.
+        level: Fractional level, clamped to the existing levels.
+        last: Result of ``last_mip``, which callers compute once for many samples.
         height: Rows of level 0.
         width: Columns of level 0.
     """
@@ -191,7 +192,7 @@ def copy_safe_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """Level 0."""
+    """Write one texel of level 0."""
     i, j = wp.tid()
     i += row_start
     levels_out[i * environment.shape[1] + j] = safe_radiance(environment[i, j])
@@ -199,9 +200,9 @@ def copy_safe_kernel(
 
 @wp.func
 def row_share(low: wp.int32, high: wp.int32, whole: wp.int32) -> wp.float32:
-    """Half of cos theta0 - cos theta1 between two rows, in units of 1 / whole of the map's height.
+    """Return half of cos theta0 - cos theta1 between two rows, given in units of 1 / whole of the map's height.
 
-    As a product of sines, and from the nearer pole: exact near both.
+    It is a product of sines, with the angle from the nearer pole, so that it is exact near both poles.
     """
     unit = 0.5 * PI / wp.float32(whole)
     middle = wp.min(low + high, 2 * whole - low - high)
@@ -217,7 +218,10 @@ def sum_columns(
     column_first: wp.int32,
     column_last: wp.int32,
 ) -> wp.vec3:
-    """Sum of a row's texels times how much of each lies between two columns, in units of 1 / width of a texel."""
+    """Return the sum of a row's texels weighted by their overlaps with a range of columns.
+
+    Columns and overlaps are integers in units of 1 / width of a texel.
+    """
     first = column_first / width
     if first * width > column_first:
         first -= 1  # integer division rounds toward zero
@@ -243,9 +247,10 @@ def sum_columns(
     return total
 
 
-# Isotropic: to be as wide as high a texel wants a box of w = 1 / sin theta times its own width. A texel of the source
-# is half as wide and holds a box of w times that, which adds (w^2 - 1) / 4 to the variance, in units of a texel of the
-# target; so the box that is taken here has the width squared w^2 - (w^2 - 1) / 4 = 1 + 3/4 (w^2 - 1).
+# A footprint that is as wide as high needs a box of w = 1 / sin theta times the texel's own width. A texel of the
+# source level is half as wide and was averaged over w times its own width already, which adds (w^2 - 1) / 4 to the
+# squared width, in units of a target texel. So the box taken here has the squared width
+# w^2 - (w^2 - 1) / 4 = 1 + 3/4 (w^2 - 1).
 @wp.func
 def reduce_texel(
     levels: wp.array[wp.vec3],
@@ -257,17 +262,18 @@ def reduce_texel(
     i: wp.int32,
     j: wp.int32,
 ) -> wp.vec3:
-    """Texel (i, j) of a (height, width) level from the level before it."""
+    """Return texel (i, j) of a (height, width) level, averaged from the level before it."""
     # Rows in units of 1 / (source_height * height) of the map's height, columns likewise.
     row_first = i * source_height
     row_last = row_first + source_height
     column_first = j * source_width
     column_last = column_first + source_width
     sin_theta = wp.sin(PI * (wp.float32(i) + 0.5) / wp.float32(height))
-    # Variances of boxes add: the source's own, widened already, gives about a quarter of what is wanted.
+    # Variances of boxes add: the source's own widening gives about a quarter of the wanted one.
     wanted = wp.min(1.0 / sin_theta, wp.float32(width))
     wider = wp.sqrt(1.0 + 0.75 * (wanted * wanted - 1.0))
-    # Every column must count equally often: boxes of whole texels do, and any symmetric box over pairs of columns.
+    # The total weight of every source column must be equal. This holds for boxes of whole texels, and for any symmetric
+    # box over pairs of columns.
     half = wp.int32(0.5 * wp.float32(source_width) * (wider - 1.0))
     column_first -= half
     column_last += half
@@ -298,7 +304,7 @@ def reduce_level_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """One texel of a level, which follows the level before it."""
+    """Write one texel of a level, which follows the level before it in the packed array."""
     i, j = wp.tid()
     offset = source_offset + source_height * source_width
     levels_out[offset + i * width + j] = reduce_texel(
@@ -314,7 +320,7 @@ def reduce_latlong_kernel(
     # Out:
     reduced_out: wp.array2d[wp.vec3],
 ):
-    """One texel of a smaller map straight from the whole one."""
+    """Write one texel of a smaller map as the mean of the texels that it covers."""
     i, j = wp.tid()
     source_height = radiance.shape[0]
     source_width = radiance.shape[1]
@@ -347,16 +353,16 @@ copy_safe = row_launcher(copy_safe_kernel, like=lambda environment, _: environme
 """Write level 0 of a packed array: the environment with bad texels made safe.
 
 Args:
-    environment: (H, W) radiance.
-    levels_out: At least H W texels.
+    environment: Radiance, (H, W).
+    levels_out: Packed array of at least H W texels.
 """
 
 
 def build_pyramid(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3]) -> None:
-    """Write a whole pyramid, every level from the one before.
+    """Write a whole pyramid, each level from the level before it.
 
     Args:
-        environment: (H, W) radiance, any size.
+        environment: Radiance, (H, W), of any size.
         levels_out: Packed pyramid, (packed_texels(H, W),).
     """
     copy_safe(environment, levels_out)
@@ -367,11 +373,11 @@ def build_pyramid(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3
 
 
 def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec3], *, scale: float = 1.0) -> None:
-    """Mean radiance over the texels of a smaller map of any size, times ``scale``.
+    """Write the mean radiance over each texel of a smaller map of any size, times ``scale``.
 
     Args:
-        radiance: (H, W).
-        reduced_out: (h, w), h <= H and w <= W.
+        radiance: Radiance, (H, W).
+        reduced_out: Smaller map, (h, w) with h <= H and w <= W.
         scale: Factor on the result.
     """
     launch(reduce_latlong_kernel, dim=reduced_out.shape, inputs=[radiance, scale], outputs=[reduced_out])

@@ -1,15 +1,16 @@
-"""The mirror ball's picture as a texture, filtered and looked up as [DH04] sections 3.1 and 3.2 do: a sphere map.
+"""Sphere map: the mirror ball's picture as a texture, filtered and looked up as in [DH04] sections 3.1 and 3.2.
 
-The square of the frame around the ball's outline is copied into a texture; what surrounds the ball fills the texture's
-corners. Mip levels are box filters of it, corners included: "the background pixels are blended in, subtly changing the
-color at silhouette edges". A direction d of light, in eye coordinates (x right, y up, z toward the viewer), is looked
-up by OpenGL's sphere mapping, which takes viewer and light to be infinitely far and the ball to lie on the camera's
-axis:
+The square of the frame around the ball's outline is copied into a texture, whose corners hold the background. Mip
+levels are box-filtered with the corners included: "the background pixels are blended in, subtly changing the color at
+silhouette edges". The light from a direction d, in eye coordinates (x right, y up, z toward the viewer), is looked up
+by OpenGL's sphere mapping, which assumes that viewer and light are infinitely far and that the ball lies on the
+camera's axis:
 
-    m = 2 sqrt(d_x^2 + d_y^2 + (d_z + 1)^2),   (s, t) = (d_x, d_y) / m + 1/2:
+    m = 2 sqrt(d_x^2 + d_y^2 + (d_z + 1)^2),   (s, t) = (d_x, d_y) / m + 1/2.
 
-the point whose normal halves the angle between d and the viewer. Nothing is divided by the ball's reflectance, for "the
-acquired environment map can be used as is". ``unwrap``'s ``area`` is exact where this is not.
+This is the point whose normal bisects the angle between d and the viewer. Values are not divided by the ball's
+reflectance, because "the acquired environment map can be used as is". The method ``area`` of the stage ``unwrap`` is
+exact where this one is approximate.
 
 References:
     [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
@@ -30,51 +31,51 @@ from warp_ar.kernels.structs import FrameParams, Probe
 wp.set_module_options({"enable_backward": False})
 
 SIZE = 64
-"""Side of the texture, a power of two: the ball of the bundled clips is about as large in the frame."""
+"""Side of the texture, a power of two, texels: about the diameter of the ball in the bundled clips, in pixels."""
 _SIZE = wp.constant(SIZE)
 DIFFUSE_SIZE = 4
-"""Side of the level that stands for diffuse light: the last one that tells directions apart everywhere."""
+"""Side of the level used for diffuse light, texels: the smallest level that still separates all directions."""
 
 
 def glossy_level(lobe: int, lobes: int) -> int:
-    """Level that stands for a lobe of width 2^(lobe - (lobes - 1)): the mirror is level 0, the widest has 2x2 texels.
+    """Return the level used for a lobe of width 2^(lobe - (lobes - 1)).
 
-    Lobes narrower than a texel of level 0 are the mirror's.
+    The mirror and lobes narrower than a texel use level 0; the widest lobe uses the level of 2x2 texels.
     """
     return 0 if lobe == 0 else max(SIZE.bit_length() - 2 - (lobes - 1 - lobe), 0)
 
 
 def level_count() -> int:
-    """Levels down to one texel."""
+    """Return the number of levels, down to one texel."""
     return SIZE.bit_length()
 
 
 def level_size(level: int) -> int:
-    """Side of a level; beyond the last one texel."""
+    """Return the side of a level, texels; 1 for levels after the last."""
     return max(SIZE >> level, 1)
 
 
 def level_offset(level: int) -> int:
-    """Index of a level's first texel."""
+    """Return the index of a level's first texel."""
     return sum(level_size(below) ** 2 for below in range(level))
 
 
 def map_texels() -> int:
-    """Texels of all levels together."""
+    """Return the number of texels of all levels."""
     return level_offset(level_count())
 
 
 @wp.struct
 class Disc:
-    """The ball's outline in the frame."""
+    """Outline of the ball in the frame."""
 
     center: wp.vec2  # column and row
-    radius: wp.vec2  # pixels along columns' and rows' axes; 0 where the ball is not before the camera
+    radius: wp.vec2  # horizontal and vertical, pixels; 0 if the ball is not in front of the camera
 
 
 @wp.func
 def find_disc(camera: FrameParams, probe: Probe) -> Disc:
-    """Outline of a ball as if it lay on the camera's axis: a circle of the angle that the ball subtends."""
+    """Return the outline of a ball, approximated as on the camera's axis: a circle of the ball's angular radius."""
     disc = Disc()
     from_camera = probe.center - camera.camera_position
     pixel = project(camera, from_camera)
@@ -87,13 +88,13 @@ def find_disc(camera: FrameParams, probe: Probe) -> Disc:
 
 @wp.func
 def sphere_coordinates(world_from_camera: wp.mat33, direction: wp.vec3) -> wp.vec2:
-    """Place in the texture, -1..1 across the ball, columns and rows, that shows the light from a world direction."""
+    """Return the texture coordinates, -1..1 across the ball (columns, rows), of the light from a world direction."""
     d = wp.transpose(world_from_camera) * direction
     # The camera looks along +z here, so the viewer is at -z; rows grow downward, against the eye's y.
     normal = wp.vec3(d[0], d[1], d[2] - 1.0)
     length = wp.length(normal)
     if length < 1.0e-6:
-        return wp.vec2(1.0, 0.0)  # straight from behind the ball: all of its outline
+        return wp.vec2(1.0, 0.0)  # light from straight behind the ball is seen along the whole outline; take one point
     return wp.vec2(normal[0] / length, normal[1] / length)
 
 
@@ -109,7 +110,7 @@ def copy_ball_kernel(
     # Out:
     sphere_map_out: wp.array[wp.vec3],
 ):
-    """Texel centres of level 0, bilinear in the frame, whose border goes on beyond it."""
+    """Sample the frame bilinearly at one texel centre of level 0; the frame's border pixels continue outside it."""
     band_row, column = wp.tid()
     row = row_start + band_row
     disc = find_disc(params[0], probes[0])
@@ -141,7 +142,7 @@ def halve_level_kernel(
     # Out:
     sphere_map_out: wp.array[wp.vec3],
 ):
-    """One texel of a level from the four of the level above it, which begins at ``above``."""
+    """Average four texels of the finer level, which begins at ``above``, to one texel of a level."""
     i, j = wp.tid()
     first = above + 4 * i * size + 2 * j
     below = first + 2 * size
@@ -152,7 +153,7 @@ def halve_level_kernel(
 
 @wp.func
 def sample_level(sphere_map: wp.array[wp.vec3], offset: wp.int32, size: wp.int32, at: wp.vec2) -> wp.vec3:
-    """Bilinear sample of a level at a place in -1..1; the border's texels go on beyond it."""
+    """Return the bilinear sample of a level at coordinates in -1..1; border texels continue outside."""
     last = wp.float32(size - 1)
     x = wp.clamp(0.5 * (at[0] + 1.0) * wp.float32(size) - 0.5, 0.0, last)
     y = wp.clamp(0.5 * (at[1] + 1.0) * wp.float32(size) - 0.5, 0.0, last)
@@ -181,7 +182,7 @@ def look_up_level_kernel(
     # Out:
     latlong_out: wp.array[wp.vec3],
 ):
-    """One texel of a latlong map that begins at ``first``, from a level of the sphere map."""
+    """Write one texel of a latlong map, which begins at ``first``, from a level of the sphere map."""
     band_row, column = wp.tid()
     row = row_start + band_row
     light = direction_from_latlong(wp.float32(row) + 0.5, wp.float32(column) + 0.5, height, width)
@@ -202,7 +203,7 @@ def trust_ball_kernel(
     confidence_out: wp.array2d[wp.float32],
     clipped_out: wp.array2d[wp.vec3],
 ):
-    """Full confidence wherever there is a ball before the camera, and whether the nearest pixel clips."""
+    """Write full confidence if the ball is in front of the camera, and the clipped channels of the nearest pixel."""
     band_row, column = wp.tid()
     row = row_start + band_row
     disc = find_disc(params[0], probes[0])
@@ -231,20 +232,20 @@ copy_ball = row_launcher(copy_ball_kernel, like=lambda *_: (SIZE, SIZE))
 
 Args:
     params: (1,) FrameParams: the camera.
-    probes: (P,) Probe; only the first is looked at.
+    probes: (P,) Probe; only the first is used.
     frame: (H, W) vec3ub, RGB codes.
     decode_table: (256,) vec3, linear value of each code.
-    linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
-    sphere_map_out: (map_texels(),) vec3; ``SIZE`` squared texels are written. Zero where the ball is not before
-        the camera.
+    linear: (H, W) vec3, radiance of a frame of more than 8 bits, read instead of its codes; else empty.
+    sphere_map_out: (map_texels(),) vec3; ``SIZE`` squared texels are written, zeros if the ball is not in front of the
+        camera.
 """
 
 
 def halve_levels(sphere_map: wp.array) -> None:
-    """Fill all levels but the first, in place: each texel is the mean of four of the level above.
+    """Fill all levels but the first, in place: each texel is the mean of four texels of the finer level.
 
     Args:
-        sphere_map: (map_texels(),) vec3, level 0 as ``copy_ball`` writes.
+        sphere_map: (map_texels(),) vec3, with level 0 written by ``copy_ball``.
     """
     for level in range(1, level_count()):
         size = level_size(level)
@@ -263,14 +264,14 @@ def look_up_level(
     scale: float = 1.0,
     rows: Rows | None = None,
 ) -> None:
-    """Write a latlong map of the light from every direction, from one level.
+    """Write a latlong map of the light from every direction, sampled from one level.
 
     Args:
         params: (1,) FrameParams: the camera's rotation.
         sphere_map: (map_texels(),) vec3, all levels.
-        level: Which; beyond the last one it is the last.
+        level: Number of the level; larger numbers mean the last level.
         shape: Rows and columns of the latlong map.
-        latlong_out: vec3, flat; ``first + rows * columns`` texels at least.
+        latlong_out: Flat array of vec3 with at least ``first + rows * columns`` texels.
         first: Index of the map's first texel.
         scale: Factor on every texel.
         rows: Band of rows of the map; None means all.
@@ -281,14 +282,15 @@ def look_up_level(
 
 
 trust_ball = row_launcher(trust_ball_kernel, outputs=2)
-"""Write how far a sphere map is trusted, and where its ball clips.
+"""Write the confidence of a sphere map and its clipped channels, per direction.
 
 Args:
     params: (1,) FrameParams: the camera.
-    probes: (P,) Probe; only the first is looked at.
+    probes: (P,) Probe; only the first is used.
     frame: (H, W) vec3ub, RGB codes.
-    linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
-    linear_clip: (2,) vec3, where that clips: alone, and beside another channel that does; needed with ``linear``.
-    confidence_out: (h, 2 h) float32: 1, or 0 where the ball is not before the camera.
-    clipped_out: (h, 2 h) vec3: 1 in the channels that clip in the nearest pixel.
+    linear: (H, W) vec3, radiance of a frame of more than 8 bits, read instead of its codes; else empty.
+    linear_clip: (2,) vec3, radiance from which a channel of ``linear`` counts as clipped: alone, and if another
+        channel of the pixel is clipped.
+    confidence_out: (h, 2 h) float32: 1, or 0 if the ball is not in front of the camera.
+    clipped_out: (h, 2 h) vec3: 1 in each clipped channel of the nearest pixel.
 """

@@ -1,5 +1,5 @@
 """Live page: a server that shows lit frames in a browser, uses the browser's camera, and edits the scene.
 
-``host`` runs frames on a thread, ``edits`` changes scenes, ``protocol`` is what page and server may say to each other,
-``server`` is the only module that speaks HTTP.
+``host`` lights frames on a thread, ``edits`` changes scenes, ``protocol`` defines the messages between page and server,
+``server`` is the only module that uses HTTP.
 """

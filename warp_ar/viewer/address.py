@@ -18,17 +18,17 @@ from warp_ar.viewer.gate import BACKLOG
 
 
 def load_context(path: Path) -> ssl.SSLContext:
-    """TLS with the certificate and key of a PEM file.
+    """Return a TLS context with the certificate and key of a PEM file.
 
     Raises:
-        UsageError: The file is no regular one, or holds no certificate with its key, or the key asks for a password.
+        UsageError: The file is not a regular file, holds no certificate with its key, or the key has a password.
     """
-    read_bytes(path, "text_bytes", UsageError, f"--tls {path}")  # a pipe in its place would be waited for
+    read_bytes(path, "text_bytes", UsageError, f"--tls {path}")  # refuses a pipe, which would block
     asked = []
 
     def password() -> str:
         asked.append(True)
-        return ""  # OpenSSL would ask the terminal
+        return ""  # without this function OpenSSL would prompt on the terminal
 
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
@@ -40,13 +40,13 @@ def load_context(path: Path) -> ssl.SSLContext:
 
 
 def make_context(host: str) -> ssl.SSLContext:
-    """TLS with a certificate made on the spot; browsers ask before they trust it.
+    """Return a TLS context with a newly made certificate. Browsers warn before they accept such a certificate.
 
     Args:
-        host: The name or address that the page is opened at.
+        host: Host name or address at which the page is opened.
 
     Raises:
-        UsageError: The package that makes certificates is not installed, or ``host`` is no name for one.
+        UsageError: The package that makes certificates is not installed, or a certificate cannot be made for ``host``.
     """
     try:
         import trustme
@@ -73,7 +73,7 @@ def own_address() -> str | None:
     """Return the address of this machine on its network; None without one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # an address for documentation: it finds the way out and sends nothing
+            probe.connect(("192.0.2.1", 9))  # an address reserved for documentation; a UDP connect sends no packet
         except OSError:
             return None
         return str(probe.getsockname()[0])
@@ -87,7 +87,7 @@ class Address:
     """Address to listen on."""
     port: int = 8720
     token: str | None = None
-    """Secret that must be in the page's address; None: no secret is required."""
+    """Secret that must be part of the page's address; None: no secret is required."""
     tls: ssl.SSLContext | None = None
     origins: tuple[str, ...] = ()
     """Origins of other sites whose pages may request the light."""
@@ -121,12 +121,12 @@ def listen(host: str, port: int, tries: int) -> socket.socket:
     """Listen at the first free port of an address.
 
     Args:
-        host: Address, or a name, of whose addresses the first is taken.
-        port: First port to try; 0 takes any that is free.
-        tries: Ports to try.
+        host: Address or host name; of a name's addresses the first is used.
+        port: First port to try; 0 takes any free port.
+        tries: Number of ports to try.
 
     Raises:
-        UsageError: There is no such address, or all the ports are taken.
+        UsageError: The address does not exist, or all tried ports are taken.
     """
     for number in range(port, port + tries):
         try:

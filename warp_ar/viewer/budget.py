@@ -29,11 +29,11 @@ from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, PRESETS, Quality
 from warp_ar.viewer.protocol import Notify, begin, failure
 
 START: Final = dataclasses.replace(BASE, name=AUTO)
-"""Quality under a budget until something can be chosen."""
+"""Quality under a budget until the costs are known."""
 _COST_FRAMES: Final = 30
-"""Number of frames whose median time is a preset's cost."""
+"""Number of newest frames whose median time is a preset's cost."""
 _TOLD: Final = 0.03
-"""Share of the measurements after which the remaining time is estimated."""
+"""Fraction of the measurements after which the remaining time is estimated."""
 _SETTLED: Final = 10
 """Number of first frames of a new pipeline that are ignored."""
 
@@ -42,20 +42,20 @@ class BudgetSetting:
     """Budget and resulting choice of methods. Methods are called by the frames' thread, unless stated otherwise."""
 
     def __init__(self, notify: Notify, folder: Path | None = None) -> None:
-        """Start switched off.
+        """Start without a budget.
 
         Args:
-            notify: Takes ``record`` whenever it has changed, on any thread.
-            folder: Folder of kept costs; None means the user's cache folder.
+            notify: Receiver of ``record``'s result after every change, called on any thread.
+            folder: Folder of stored costs; None means the user's cache folder.
         """
         self._notify, self._folder = notify, folder or cache_folder()
         self._errors = load_errors()
         self.budget: float | None = None
         """Milliseconds per frame; None while switched off."""
         self.last_budget = DEFAULT_BUDGET_MS
-        """The last one that was set, or the default."""
+        """Budget that was set last, or the default, milliseconds per frame."""
         self.stopped = False
-        """True: nothing more is measured. Set from any thread."""
+        """True ends all measuring. Set from any thread."""
         self._controller: Controller | None = None
         self._key: str | None = None
         self._costs: Costs | None = None
@@ -71,28 +71,29 @@ class BudgetSetting:
 
     @property
     def measuring(self) -> bool:
-        """True while costs are being measured; frames should then leave time for it."""
+        """True while costs are being measured. The frames should then pause, as they would disturb the timing."""
         return self._progress is not None
 
     def switch(self, budget: float | None) -> None:
-        """Set the budget, or with None switch off. From any thread."""
+        """Set the budget, milliseconds per frame; None switches it off. From any thread."""
         self.last_budget = budget or self.last_budget
         self.budget = budget
 
     def look(self, pipeline: Pipeline, image: npt.NDArray[np.uint8], pose: Pose | None, helper: Executor) -> None:
-        """Learn the costs for what ``pipeline`` shows: from the cache, else by measuring as soon as there is a budget.
+        """Get the costs of methods for a pipeline's scene and size, from the cache or else by measuring.
+
+        Measuring begins once a budget is set.
 
         Args:
-            pipeline: Pipeline of the frames, with the scene as it is edited.
-            image: A frame that shows what the scene needs to see.
-            pose: The camera's in it.
-            helper: Runs the measurements, a step at a time.
+            pipeline: Pipeline of the frames, with the edited scene.
+            image: Frame that shows the marker and the mirror ball, as far as the scene uses them.
+            pose: ``camera_from_world`` of that frame.
+            helper: Executor of the measurements, one step per task.
         """
         if self.measuring or self.stopped:
             return
         scene, size = pipeline.scene, pipeline.size
-        # Edits change costs as load does; only another scene, its frames' size or an unknown setting ask for a new
-        # look.
+        # An edit changes costs no more than load on the machine does. Only another scene or frame size needs new costs.
         key = f"{scene.name} {size}"
         if key != self._key:
             self._key = key
@@ -117,7 +118,7 @@ class BudgetSetting:
             write_costs(self._folder, self._cache_key, end.value)
             self._adopt(end.value)
         except Exception as error:
-            self._failed = key  # else they would be measured again and again
+            self._failed = key  # otherwise the next frame would start the same measurement again
             self._notify(failure(error, "what methods cost stays unknown"))
         finally:
             self._progress = progress
@@ -134,11 +135,11 @@ class BudgetSetting:
         self._controller, self._offer = controller, self._list(controller, costs)
 
     def choose(self, milliseconds: float | None, now: float) -> Quality | None:
-        """Return the quality under the budget; None if it is unknown or there is no budget.
+        """Return the quality under the budget; None without a budget or while costs are unknown.
 
         Args:
-            milliseconds: Time of the last frame; None if it does not apply to the present choice.
-            now: Seconds on a clock that does not jump.
+            milliseconds: Time of the last frame; None if another choice of methods lit it.
+            now: Time on a monotonic clock, seconds.
         """
         controller, budget = self._controller, self.budget
         if controller is None or budget is None:
@@ -150,11 +151,11 @@ class BudgetSetting:
         return dataclasses.replace(turn(BASE, controller.settings), name=AUTO)
 
     def observe(self, preset: str, milliseconds: float | None) -> Quality | None:
-        """Record the time of a frame, and return the quality for the next frames, as ``choose``.
+        """Record the time of a frame and return the quality for the next frames, as ``choose`` does.
 
         Args:
-            preset: Name of the quality that it was lit by.
-            milliseconds: Time of the frame; None if it does not apply to that quality.
+            preset: Name of the quality that lit the frame.
+            milliseconds: Time of the frame; None if that quality did not light all of it.
         """
         self._since_restart += 1
         if self.measuring:
@@ -163,14 +164,15 @@ class BudgetSetting:
         return self.choose(milliseconds, time.monotonic())
 
     def note(self, preset: str, milliseconds: float | None) -> None:
-        """Record the time of a frame as a preset's cost; None is ignored."""
+        """Record the time of a frame under a preset's name; None is ignored."""
         if milliseconds is not None:
             self._preset_ms.setdefault(preset, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
 
     def costs(self) -> dict[str, dict[str, Any]]:
-        """Return each preset's milliseconds per frame: the measured median, else the cost table's, scaled.
+        """Return each preset's milliseconds per frame and the number of measured frames.
 
-        ``frames`` is the number of measured frames. A preset that is not in the table is left out until it has run.
+        A preset that has run gets the median of its frames. Others get the cost table's value, scaled by the mean ratio
+        of measured to tabulated times. A preset that has not run and is not in the table is left out.
         Callable from any thread.
         """
         ran = {name: (statistics.median(ms), len(ms)) for name, ms in list(self._preset_ms.items()) if ms}
@@ -179,18 +181,18 @@ class BudgetSetting:
         return {name: {"ms": round(ms, 2), "frames": count} for name, (ms, count) in (scaled | ran).items()}
 
     def forget_costs(self, preset: str | None = None) -> None:
-        """Forget the times of a preset; None means all: another scene is shown. From any thread."""
+        """Forget the times of a preset; None forgets all, as for a new scene. From any thread."""
         for name in [preset] if preset is not None else list(self._preset_ms):
             self._preset_ms.pop(name, None)
 
     def restart(self) -> None:
-        """Forget the frames so far: another pipeline lights those to come."""
+        """Restart the frame count and the controller after a change of pipeline."""
         self._since_restart = 0
         if self._controller is not None:
             self._controller.restart()
 
     def state(self) -> dict[str, Any] | None:
-        """Return the present choice; None while there is none. From any thread."""
+        """Return the chosen methods with expected time and error; None while none are chosen. From any thread."""
         controller = self._controller
         if controller is None or self.budget is None:
             return None
@@ -202,15 +204,15 @@ class BudgetSetting:
         }
 
     def record(self) -> dict[str, Any]:
-        """Return all choices as a message for the page. From any thread."""
+        """Return all choices of methods as a message for the page. From any thread."""
         told = {"measuring": self._progress, "remaining": self._remaining(), "known": self._controller is not None}
         errors = {name: round(error, 3) for name, error in self._preset_errors.items()}
         return {"type": "budget", **told, "errors": errors, **self._offer}
 
     def _whole_error(self, error: float) -> float:
-        """Return the error of a whole picture by the sum of its methods' errors, which are not independent.
+        """Convert a sum of methods' errors to the error of a whole picture, which is no plain sum.
 
-        Presets have been measured both ways: theirs is as measured, others lie between.
+        Both are known for the presets. Other values are interpolated between the presets.
         """
         sums = {
             name: sum(self._errors[setting.name][chosen(PRESETS[name], setting)] for setting in self._settings)
@@ -220,7 +222,7 @@ class BudgetSetting:
         return round(float(np.interp(error, *np.transpose(known))), 3) if known else error
 
     def _remaining(self) -> float | None:
-        """Seconds that the measurements still take, at the pace so far; None while there is too little to tell by."""
+        """Estimate the seconds that the measurements still take; None during their first ``_TOLD``."""
         progress = self._progress
         if progress is None or progress < _TOLD:
             return None

@@ -1,7 +1,7 @@
 """State shared by the page's threads: the source, the wanted scene, its edits, and their lock.
 
-A user's own scene names a capture device of this machine. If it is absent, the page says so until a browser's camera is
-used instead; its pictures are received here.
+A scene may name a capture device of this machine. If the device is absent, the page shows a notice until a viewer uses
+the camera of a browser. Pictures of a browser's camera are received here.
 """
 
 from __future__ import annotations
@@ -36,11 +36,14 @@ Image = npt.NDArray[np.uint8]
 MOST_EDITS: Final = 100
 """Edits that can be undone."""
 TOGETHER_SECONDS: Final = 1.0
-"""Seconds within which successive changes of one value count as one edit, such as dragging a slider."""
+"""Longest time between two changes of one value that count as one edit (a dragged slider), seconds."""
 
 
 class History:
-    """Undo history: edits in order, each with a label and the state before or after it. The owner holds a lock."""
+    """Undo history: edits in order, each with a label and the state before or after it.
+
+    Callers hold the lock of the ``Controls`` that own the history.
+    """
 
     def __init__(self) -> None:
         self.done: list[tuple[str, Wanted]] = []
@@ -48,12 +51,12 @@ class History:
         self._last = -TOGETHER_SECONDS
 
     def note(self, label: str, before: Wanted, now: float) -> None:
-        """Note an edit.
+        """Record an edit.
 
         Args:
-            label: Its words; successive edits with the same words may become one.
-            before: State before it.
-            now: Seconds on a clock that does not jump.
+            label: Description of the edit. Successive edits with equal labels may be merged.
+            before: State before the edit.
+            now: Time on a monotonic clock, seconds.
         """
         self.undone.clear()
         same = bool(self.done) and self.done[-1][0] == label and now - self._last < TOGETHER_SECONDS
@@ -62,23 +65,27 @@ class History:
             self.done = [*self.done, (label, before)][-MOST_EDITS:]
 
     def move(self, wanted: Wanted, *, back: bool) -> Wanted | None:
-        """Undo the last edit, or with ``back`` False redo the last undone one; return None without one."""
+        """Undo the last edit, or with ``back`` False redo the last undone edit.
+
+        Returns:
+            The new state; None if there is no such edit.
+        """
         source, target = (self.done, self.undone) if back else (self.undone, self.done)
         if not source:
             return None
         label, other = source.pop()
         target.append((label, wanted))
         self._last = -TOGETHER_SECONDS
-        # The quality is no edit: a budget chooses it too.
+        # Quality is not part of the history, as a budget changes it too.
         return dataclasses.replace(other, quality=wanted.quality)
 
     def drop(self, before: Wanted) -> None:
-        """Forget the last edit if ``before`` is the state before it: it could not be made."""
+        """Remove the last edit if ``before`` is the state before it, because its pipeline could not be built."""
         if self.done and dataclasses.replace(self.done[-1][1], quality=before.quality) == before:
             self.done.pop()
 
     def clear(self) -> None:
-        """Forget all."""
+        """Forget all edits."""
         self.done.clear()
         self.undone.clear()
 
@@ -87,24 +94,24 @@ REMEDY: Final = "press “My camera”, which opens the camera of the machine th
 
 
 class NoCamera(Source):
-    """Source that repeats one grey picture, while pipelines are built and the page explains what to do."""
+    """Source that stands in for an absent camera: it repeats one grey picture while the page shows the remedy."""
 
     live, length, fps = True, None, 2.0
 
     def __init__(self, size: tuple[int, int], error: SourceError) -> None:
-        """Keep the fault.
+        """Create the source.
 
         Args:
             size: (width, height) of the picture, pixels.
-            error: Error of the capture device.
+            error: Error of the capture device, shown on the page.
         """
         self.size, self.description, self.error = size, "no camera", error
         self.finding = Finding("source.absent", str(error).partition(";")[0], REMEDY)
-        """Fault, and its remedy on the page."""
+        """Error of the capture device and its remedy, as shown on the page."""
         self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Frame]:
-        """The picture, until the source is closed."""
+        """Yield the picture, twice a second, until the source is closed."""
         image, self.start = np.full((self.size[1], self.size[0], 3), 64, np.uint8), time.monotonic()
         for index in itertools.count():
             yield Frame(index, time.monotonic() - self.start, image)
@@ -121,7 +128,7 @@ CAMERA: Final = "camera"
 TRACED: Final = "traced"
 DIFFERENCE: Final = "difference"
 CONVERGING: Final = (TRACED, DIFFERENCE)
-"""Comparisons of a held picture: with the reference, or with the difference to it in colours."""
+"""Comparisons of a held frame: with the reference, or with the difference to the reference in false colours."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,11 +137,11 @@ class Feed:
 
     source: Source
     camera: Camera | None = None
-    """Another camera than the scene's."""
+    """Camera that replaces the scene's; None keeps the scene's."""
     wanted: Wanted | None = None
-    """State to show from then on."""
+    """State to show once this feed is in use; None keeps the present state."""
     owner: object = None
-    """The viewer whose camera it is."""
+    """Viewer whose camera is the source; None for other sources."""
     estimated: bool = False
     """True once the camera's focal length has been estimated from frames."""
 
@@ -145,10 +152,15 @@ class Feed:
 
 
 def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | None = None) -> Feed:
-    """Open a scene's own source, or the one that was given; of a capture device that is not there a ``NoCamera``.
+    """Open the given source, or without one the scene's own; an absent capture device gives a ``NoCamera``.
+
+    Args:
+        scene: Scene of the frames.
+        given: Source to open instead of the scene's.
+        wanted: State of the new feed.
 
     Raises:
-        WarpArError: It cannot be opened, or the scene names none.
+        WarpArError: The source cannot be opened, or no source is given and the scene names none.
     """
     try:
         return Feed(open_scene_source(scene, given, loop=True), wanted=wanted)
@@ -159,7 +171,7 @@ def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | Non
 
 
 def _is_device(source: str | int | Path | None) -> bool:
-    """Return True for a capture device that there may be."""
+    """Return True if the source is a plausible index of a capture device."""
     if isinstance(source, str) and source.isdecimal() and len(source) <= 4 and not Path(source).exists():
         source = int(source)
     return isinstance(source, int) and 0 <= source <= MOST_INDEX
@@ -168,22 +180,22 @@ def _is_device(source: str | int | Path | None) -> bool:
 class Controls:
     """State of the page: source, scene, comparison, playing or held.
 
-    Methods may be called from any thread; whoever waits holds ``changed``.
+    Methods may be called from any thread. A caller that waits for a change must hold ``changed``.
     """
 
     def __init__(self, feed: Feed, wanted: Wanted, notify: Notify) -> None:
         self._notify = notify
         self.changed = threading.Condition()
-        """Guards all of this; notified at every change."""
+        """Lock of this object's state, notified at every change."""
         self.wanted = wanted
-        """State that viewers see now, or will once it is built."""
+        """State that viewers see, at the latest once its pipeline is built."""
         self.compare = ""
-        """Second picture: nothing, ``CAMERA``, one of ``CONVERGING`` or a preset."""
+        """Picture to compare with: empty for none, ``CAMERA``, one of ``CONVERGING``, or a preset."""
         self.playing = True
         self.watchers = 0
-        """Viewers; without any, no frame is lit."""
+        """Number of viewers; frames are lit only while there is one."""
         self.edits = 0
-        """Grows with every change of what is shown."""
+        """Counter of changes that need a new picture."""
         self.stopped = False
         self.feed = feed
         self._next: Feed | None = None
@@ -191,23 +203,23 @@ class Controls:
 
     @property
     def newest_feed(self) -> Feed:
-        """The feed that was asked for last; the frames may still come from the one before."""
+        """Feed that was requested last. Frames may still come from the previous feed."""
         return self._next or self.feed
 
     @property
     def leaving(self) -> bool:
-        """True if the present source shall be left."""
+        """True if frames of the present source shall end."""
         return self.stopped or self._next is not None
 
     def wait(self, seconds: float | None = None) -> None:
-        """Wait so long, or without an end, until the present source shall be left."""
+        """Wait until the present source shall be left, for at most so many seconds; None sets no limit."""
         with self.changed:
             self.changed.wait_for(lambda: self.leaving, timeout=seconds)
 
     def _adopt(self, wanted: Wanted | None) -> None:
-        """Want something else, or with None the same, and tell viewers; to be called with the lock held.
+        """Set the wanted state (None keeps it) and send it to the viewers.
 
-        So the last that they hear is the state that is.
+        The caller holds the lock, so that the last message always describes the final state.
         """
         if wanted is not None:
             self.wanted = wanted
@@ -215,11 +227,11 @@ class Controls:
         self._notify(self.scene_message())
 
     def change(self, make: Callable[[Wanted], Wanted], label: str | None = None) -> None:
-        """Make the wanted state anew from the one before.
+        """Replace the wanted state by a function of it.
 
         Args:
-            make: Function from the wanted state to the next.
-            label: Words of the edit; None is no edit, and cannot be undone.
+            make: Function from the present wanted state to the next.
+            label: Description of the edit; None records no edit, so that the change cannot be undone.
         """
         with self.changed:
             before, wanted = self.wanted, make(self.wanted)
@@ -228,36 +240,36 @@ class Controls:
             self._adopt(wanted)
 
     def undo(self) -> None:
-        """Take the last edit back; without one nothing happens."""
+        """Undo the last edit, if there is one."""
         with self.changed:
             self._adopt(self._history.move(self.wanted, back=True))
 
     def redo(self) -> None:
-        """Make the edit again that was taken back last; without one nothing happens."""
+        """Redo the edit that was undone last, if there is one."""
         with self.changed:
             self._adopt(self._history.move(self.wanted, back=False))
 
     def give_back(self, good: Wanted, refused: Wanted) -> None:
-        """Want again the state before an edit that could not be built, unless something else is wanted by now."""
+        """Restore the last good state if the refused state, whose pipeline could not be built, is still wanted."""
         with self.changed:
             if self.wanted is refused:
                 self._history.drop(good)
                 self._adopt(good)
 
     def start_anew(self, wanted: Wanted) -> None:
-        """Want another scene; edits of the one before are forgotten."""
+        """Show another scene and forget the edits of the previous one."""
         with self.changed:
             self._history.clear()
             self._adopt(wanted)
 
     def scene_message(self) -> dict[str, Any]:
-        """Return the message of the scene as it is edited, with the edits that can be undone."""
+        """Return the message of the edited scene, with the labels of the edits that undo and redo would affect."""
         with self.changed:
             undo, redo = (edits[-1][0] if edits else None for edits in (self._history.done, self._history.undone))
             return {"type": "scene", "scene": wanted_record(self.wanted), "undo": undo, "redo": redo}
 
     def camera_of(self, feed: Feed, wanted: Wanted | None = None) -> Camera:
-        """Return the camera that took a feed's frames, as far as it is known."""
+        """Return a feed's camera: calibrated on the page, else the feed's own, else the scene's."""
         wanted = wanted or self.wanted
         return wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
 
@@ -266,10 +278,10 @@ class Controls:
         self.changed.notify_all()
 
     def set_compare(self, other: str) -> None:
-        """Choose what stands beside the picture.
+        """Choose the picture to compare with.
 
         Raises:
-            UsageError: There is no such choice.
+            UsageError: ``other`` is not a known comparison.
         """
         if other not in ("", CAMERA, *CONVERGING, *PRESETS):
             known = ", ".join((CAMERA, *CONVERGING))
@@ -279,13 +291,13 @@ class Controls:
             self._touch()
 
     def play(self, on: bool) -> None:
-        """Let frames flow, or hold the one in hand."""
+        """Play frames (True), or hold the present frame (False)."""
         with self.changed:
             self.playing = on
             self.changed.notify_all()
 
     def watch(self, change: int) -> None:
-        """One viewer more (1) or less (-1)."""
+        """Count one viewer more (1) or less (-1)."""
         with self.changed:
             self.watchers += change
             self.edits += change > 0
@@ -300,7 +312,7 @@ class Controls:
             self.feed.source.close()
 
     def switch(self, feed: Feed) -> None:
-        """Go on with another source after the frame in hand."""
+        """Use another feed after the present frame."""
         with self.changed:
             left, self._next = self._next, feed
             current = self.feed.source
@@ -311,7 +323,7 @@ class Controls:
             current.close()
 
     def adopt(self) -> bool:
-        """Take the feed that was asked for last; return True if there was one."""
+        """Start to use the feed that was requested last; return False if none was requested."""
         with self.changed:
             if self._next is None:
                 return False
@@ -322,7 +334,7 @@ class Controls:
         return True
 
     def use_estimate(self, camera: Camera, feed: Feed) -> bool:
-        """Use the camera estimated from a feed's frames; return False if the feed has been left."""
+        """Use the camera estimated from a feed's frames; return False if that feed is no longer in use."""
         with self.changed:
             if self._next is not None or self.feed is not feed:
                 return False
@@ -331,7 +343,7 @@ class Controls:
         return True
 
     def close(self) -> None:
-        """Let the sources go."""
+        """Close all sources."""
         self.stopped = True
         for feed in (self.feed, self._next):
             if feed is not None:
@@ -339,45 +351,52 @@ class Controls:
 
 
 DEFAULT_FIELD_OF_VIEW: Final = 60.0
-"""Horizontal, degrees: between a phone's main camera (65 to 70) and a laptop's (50 to 60)."""
+"""Horizontal field of view, degrees: between those of phones' main cameras (65 to 70) and of laptops (50 to 60)."""
 
 
 def guessed_camera(width: int, height: int, transfer: Any = "srgb", focal: float | None = None) -> Camera:
-    """Return a camera with square pixels, a central principal point, no distortion, and the default field of view."""
+    """Return a camera with square pixels, a central principal point and no distortion.
+
+    Args:
+        width: Columns of its frames.
+        height: Rows of its frames.
+        transfer: Transfer function, as in a scene file.
+        focal: Focal length, pixels; None means that of the default field of view.
+    """
     focal = focal or 0.5 * width / math.tan(0.5 * math.radians(DEFAULT_FIELD_OF_VIEW))
     return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), transfer=transfer)
 
 
 _LEAD_MS: Final = 40.0
-"""Typical time for a picture of a browser's camera to be packed, sent and unpacked."""
+"""Typical time to encode, send and decode a picture of a browser's camera, milliseconds."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pushed:
-    """A picture of a browser's camera on its way to being lit."""
+    """Picture of a browser's camera that waits to be lit."""
 
     image: Image
     id: int
     taken: float
-    """Time at which it came, seconds of ``time.monotonic``."""
+    """Time of arrival, seconds of ``time.monotonic``."""
     stamp: float
-    """Time at which it was taken, milliseconds of the browser's own clock."""
+    """Time of capture, milliseconds on the browser's own clock."""
 
 
 class BrowserCamera:
-    """Takes pictures that a viewer pushes. Methods may be called from any thread."""
+    """Receiver of pictures from a viewer's camera. Methods may be called from any thread."""
 
     def __init__(self, controls: Controls, notify: Notify) -> None:
         self._controls, self._notify = controls, notify
         self._choosing = threading.Lock()
-        """Held by who makes a camera the source: of two viewers who ask at once one is refused."""
+        """Lock of ``use``: of two viewers that offer their cameras at once, one is refused."""
         self._pushed: collections.deque[Pushed] = collections.deque(maxlen=4)
 
     def use(self, width: int, height: int, owner: object) -> None:
-        """Make ``owner``'s camera the source.
+        """Make the camera of the viewer ``owner`` the source.
 
         Raises:
-            UsageError: Another viewer's camera is.
+            UsageError: Another viewer's camera is the source.
         """
         controls = self._controls
         with self._choosing:
@@ -393,17 +412,17 @@ class BrowserCamera:
         return feed.is_browser and feed.owner is owner
 
     def size(self, owner: object) -> tuple[int, int] | None:
-        """Return the size of the pictures that ``owner`` may push now; None if it is not the source."""
+        """Return the size of the pictures that ``owner`` may push; None if its camera is not the source."""
         return self._controls.newest_feed.source.size if self.is_of(owner) else None
 
     def push(self, taken: protocol.Picture, owner: object) -> None:
-        """Take a picture; blocks while it is decoded.
+        """Decode a picture and queue it as a frame; blocks while decoding.
 
-        The page hears of it again, as ``taken``, when it is its turn to be lit: sooner, another would only take its
-        place.
+        When the frame is about to be lit, ``begin`` sends the page the message ``taken``, after which the page sends
+        the next picture. A picture sent earlier would only replace the queued one.
 
         Raises:
-            ProtocolError: It cannot be decoded.
+            ProtocolError: The picture cannot be decoded.
         """
         picture = decode_picture(taken.jpeg, cv2.IMREAD_COLOR_RGB, protocol.ProtocolError, "picture")
         feed = self._controls.newest_feed
@@ -415,15 +434,15 @@ class BrowserCamera:
         feed.source.push(picture, now)
 
     def begin(self, image: Image, busy_ms: float) -> Pushed | None:
-        """Say that a frame is about to be lit; return its record if it was pushed.
+        """Tell the page that a frame is about to be lit; return the frame's record, or None if no viewer pushed it.
 
         Args:
             image: The frame.
-            busy_ms: Time that lighting a frame takes.
+            busy_ms: Time that lighting a frame takes, milliseconds.
         """
         pushed = next((item for item in tuple(self._pushed) if item.image is image), None)
         if pushed is not None:
-            # The next one shall come when this one is done, not sooner, and not have waited by then.
+            # The next picture should arrive just when this frame is done: no earlier, or it would wait and age.
             wait = max(busy_ms - _LEAD_MS, 0.0)
             self._notify({"type": "taken", "id": pushed.id, "wait": round(wait, 1)})
         return pushed

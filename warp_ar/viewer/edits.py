@@ -1,4 +1,4 @@
-"""Edits of scenes by the page; every change is checked as in a scene file.
+"""Edits of a scene by the page; each edited scene is checked by the rules of scene files.
 
 Animations of glTF files can be chosen, started, paused and accelerated without a jump of the pose.
 """
@@ -52,13 +52,13 @@ _T = TypeVar("_T")
 NONE = -1
 """Index for no animation: nodes keep the file's static transforms."""
 _LIGHT_REACH, _STEP, _GOLDEN, _PLACES = 0.03, 0.02, 2.399963, 400
-"""Of places for what is new: metres around a light, metres and radians of the spiral's steps, and how many."""
+"""Search for a free place: radius kept around a light, m; spiral step, m; spiral angle, rad; number of places tried."""
 _DIGITS = 4
-"""Decimal places of seconds that the page writes into scene files."""
+"""Decimal places of times, seconds, that the page writes into scene files."""
 
 
 def names_of(item: Object) -> tuple[str, ...]:
-    """Return the names of the animations of an object's file, by number; one without a name gets its number."""
+    """Return the names of the animations in an object's file, in order; an unnamed one is called by its number."""
     if item.file is None or item.mesh is not None or item.file.suffix.lower() not in GLTF_SUFFIXES:
         return ()
     return _names(item.file, file_stamp(item.file))
@@ -69,7 +69,7 @@ def _names(path: Path, stamp: tuple[int, int]) -> tuple[str, ...]:
     try:
         return tuple(name or f"Animation {number}" for number, name in enumerate(animations_of(path)))
     except SceneError:
-        return ()  # the scene that shows the object says what is wrong
+        return ()  # the error is reported when the scene is loaded
 
 
 def play_record(item: Object) -> dict[str, Any]:
@@ -86,17 +86,17 @@ def play_record(item: Object) -> dict[str, Any]:
 
 
 def set_play(item: Object, key: str, value: float, seconds: float) -> Object:
-    """Return the object with one value of its animation changed; its pose at that moment stays.
+    """Return the object with one value of its animation changed, without a jump of its present pose.
 
     Args:
         item: An object with a glTF file.
-        key: ``animation``: its number, ``NONE`` for none, which begins at once; ``speed``; ``loop``; ``paused``: 0 goes
-            on from the pose that is held, or anew if that is the last one.
+        key: ``animation`` starts an animation by its number, or ends it with ``NONE``. ``speed`` and ``loop`` change
+            the playback. ``paused`` = 0 continues from the held pose, or restarts a finished animation.
         value: Number or flag.
-        seconds: Of the frame that is shown, since the first.
+        seconds: Time of the shown frame since the first frame.
 
     Raises:
-        UsageError: The object's file has no such animation, or it plays none.
+        UsageError: The object's file has no such animation, or the object plays no animation.
     """
     names = names_of(item)
     if key == "animation":
@@ -117,14 +117,14 @@ def set_play(item: Object, key: str, value: float, seconds: float) -> Object:
 
 
 MOST_PARTS: Final = 16
-"""Objects, lights or proxies in a scene that the page may add to."""
+"""Largest number of objects (or lights, or proxies) to which the page can add."""
 RULER: Final = 0.1
-"""Metres that each ruler of the card has in a print at true scale."""
+"""Length of each ruler on the printed card at true scale, metres."""
 _SCALES: Final = (0.5, 1.5)
-"""Smallest and largest ratio of a ruler's measured to nominal length; others are misread."""
+"""Smallest and largest accepted ratio of a ruler's measured to nominal length; beyond, it was misread."""
 
 _LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "probe": "probes"}
-# No key that names a file is among them.
+# Keys that the page may set. None of them names a file.
 _KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "object": ("at", "rotate", "scale", "radius", "size", "major_radius", "minor_radius"),
     "light": ("at", "target", "direction", "color", "intensity", "inner_angle", "outer_angle", "radius"),
@@ -155,10 +155,10 @@ _NEW: Final[Mapping[tuple[str, str], Object | Light | Proxy]] = {
 
 
 def checked(scene: Scene) -> Scene:
-    """Return the scene as its file would be read.
+    """Write the scene as a scene file, read that again, and return the result.
 
     Raises:
-        SceneError: The file would be refused.
+        SceneError: The reader refuses the file.
     """
     return dataclasses.replace(loads_scene(dumps_scene(scene)), path=scene.path)
 
@@ -167,13 +167,13 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
     """Return the scene with the printed card as its marker and a mirror ball on the card's cross.
 
     Args:
-        scene: The scene; its balls go, its objects and lights stay, and it gets a table if it has none. Where its
-            marker was another one, walls and boxes go as well: they stood around that marker.
-        radius: Of the ball, metres.
-        ruler: Length that the print's rulers of 100 mm have, metres.
+        scene: The scene. Its objects and lights are kept, its balls are replaced, and a table is added if it has none.
+            If it had another marker, its walls and boxes are removed, as their places refer to that marker.
+        radius: Radius of the ball, metres.
+        ruler: Measured length of the print's rulers of 100 mm, metres.
 
     Raises:
-        UsageError: The radius is no ball's that stands on the card, or the ruler was read wrong.
+        UsageError: The ball does not fit the card, or the ruler's length is implausible.
     """
     largest = 1.25 * max(RINGS)
     if not 0.005 <= radius <= largest:
@@ -204,16 +204,16 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
 
 
 def card_ruler(scene: Scene) -> float | None:
-    """Return the length of the rulers of the scene's printed card, metres; None where its marker is another one."""
+    """Return the length of the rulers on the scene's printed card, metres; None if its marker is no printed card."""
     scale = card_scale(scene.marker)
     return None if scale is None else RULER * scale
 
 
 def _items(scene: Scene, part: str, index: int) -> list[Any]:
-    """Return the scene's objects, lights, proxies or balls, of which one is to be changed.
+    """Return a new list of the scene's objects, lights, proxies or balls.
 
     Raises:
-        UsageError: There is no such one.
+        UsageError: The list has no item of that index.
     """
     items = list(getattr(scene, _LISTS[part]))
     if index >= len(items):
@@ -228,12 +228,12 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
         scene: The scene.
         part: ``object``, ``light``, ``proxy``, ``probe``, ``exposure`` or ``marker``.
         index: Number of the part.
-        key: A key of the scene file's section, or of its material.
+        key: Key of the part's section in a scene file, or of its material.
         value: A number, a tuple of numbers or a word.
 
     Raises:
-        UsageError: There is no such part, or it has no such key that could be edited.
-        SceneError: The scene file would refuse the value.
+        UsageError: The scene has no such part, or the part has no such editable key.
+        SceneError: The value is not valid in a scene file.
     """
     items = _items(scene, part, index) if part in _LISTS else []
     item = items[index] if items else getattr(scene, part)
@@ -246,13 +246,13 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
         if key in ("target", "direction"):
             changes["direction" if key == "target" else "target"] = None
         if part == "marker" and key in ("id", "size"):
-            changes["board"] = None  # a marker of its own instead of a board's
+            changes["board"] = None  # a single marker replaces the board
     made: Any = dataclasses.replace(item, **changes)
     return _replaced(scene, part, index, made) if items else checked(dataclasses.replace(scene, **{part: made}))
 
 
 def _replaced(scene: Scene, part: str, index: int, *made: Any) -> Scene:
-    """Return the scene with other items in place of one."""
+    """Return the scene with one item of a list replaced by the given items, or removed if none are given."""
     items = _items(scene, part, index)
     items[index : index + 1] = made
     lists: dict[str, Any] = {_LISTS[part]: tuple(items)}
@@ -260,7 +260,7 @@ def _replaced(scene: Scene, part: str, index: int, *made: Any) -> Scene:
 
 
 def _shown_material(item: Object) -> Material:
-    """Return an object's material: chalk for an object without a file and without a material."""
+    """Return an object's material: the default Lambertian if it has neither a material nor a file."""
     return LambertMaterial() if isinstance(item.material, FileMaterial) and item.shape != "mesh" else item.material
 
 
@@ -270,7 +270,7 @@ def _material(material: Material, key: str, value: Any) -> Material:
             raise UsageError(f"material: model {value!r}; expected {', '.join(MATERIALS)}")
         if value == "file":
             return FileMaterial()
-        first = iter(vars(material).values())  # of every model but the file's own its colour
+        first = iter(vars(material).values())  # the colour, which all models but ``file`` declare first
         color: Any = next(first, LambertMaterial.base_color)
         made: Any = MATERIALS[value]
         if made is EmissiveMaterial and isinstance(color, Path):
@@ -290,11 +290,11 @@ def add_part(scene: Scene, part: str, kind: str) -> Scene:
 
 
 def add_item(scene: Scene, part: str, item: Object | Light | Proxy) -> Scene:
-    """Return the scene with one object, light or proxy more; objects and lights stand apart from those before.
+    """Return the scene with one more object, light or proxy; a new object or light is moved to a free place.
 
     Raises:
-        UsageError: It has as many as it may have.
-        SceneError: The scene file would refuse it.
+        UsageError: The scene has ``MOST_PARTS`` of them already.
+        SceneError: The item is not valid in a scene file.
     """
     items = getattr(scene, _LISTS[part])
     if len(items) >= MOST_PARTS:
@@ -304,11 +304,11 @@ def add_item(scene: Scene, part: str, item: Object | Light | Proxy) -> Scene:
 
 
 def set_animation(scene: Scene, index: int, key: str, value: float, seconds: float) -> Scene:
-    """Return the scene with one value of an object's animation changed; arguments as those of ``set_play``.
+    """Return the scene with one value of an object's animation changed; see ``set_play`` for the arguments.
 
     Raises:
-        SceneError: As ``set_play``.
-        UsageError: There is no such object.
+        SceneError: The object is not valid in a scene file.
+        UsageError: The scene has no such object, or ``set_play`` refuses the value.
     """
     item = _items(scene, "object", index)[index]
     return _replaced(scene, "object", index, set_play(item, key, value, seconds))
@@ -319,31 +319,31 @@ class Wanted:
     """State that viewers want to see."""
 
     scene: Scene
-    """The scene, edited."""
+    """Edited scene."""
     quality: Quality
-    """The preset."""
+    """Preset, or the quality chosen under a budget."""
     off: frozenset[str] = frozenset()
     """Effects that are switched off."""
     hidden: frozenset[tuple[str, int]] = frozenset()
-    """(part, index) of objects, lights and proxies that are hidden."""
+    """(part, index) of hidden objects, lights and proxies."""
     methods: tuple[tuple[str, str], ...] = ()
-    """(stage, method) that differ from the preset's."""
+    """(stage, method) pairs that replace the preset's methods."""
     cameras: tuple[Camera, ...] = ()
-    """Cameras that were calibrated, one for each size of frames, instead of the scene's."""
+    """Cameras calibrated on the page, at most one per frame size; each replaces the scene's camera."""
     materials: tuple[tuple[int, Material], ...] = ()
-    """Materials that objects had before their models were changed, with the objects' numbers; the newest last."""
+    """(object's index, material) from before each change of a material's model, newest last."""
 
     def camera_of(self, size: tuple[int, int]) -> Camera | None:
-        """Return the calibrated camera of frames of a size; None where none was calibrated."""
+        """Return the calibrated camera for frames of a size, (width, height); None if none was calibrated."""
         return next((camera for camera in self.cameras if (camera.width, camera.height) == size), None)
 
     def with_camera(self, camera: Camera) -> Wanted:
-        """Return this with a calibrated camera for frames of its size."""
+        """Return this state with a calibrated camera for frames of the camera's size."""
         others = (own for own in self.cameras if (own.width, own.height) != (camera.width, camera.height))
         return dataclasses.replace(self, cameras=(*others, camera))
 
     def shown_scene(self) -> Scene:
-        """Return the scene without what is hidden or switched off: the one that a file of this picture holds."""
+        """Return the scene without hidden parts and switched-off effects, as the picture shows it and files save it."""
         effects = {"object": "objects", "light": "lights", "probe": "environment", "proxy": "receiver"}
         lists: dict[str, Any] = {}
         for part, effect in effects.items():
@@ -353,7 +353,7 @@ class Wanted:
         return dataclasses.replace(self.scene, **lists, exposure=exposure)
 
     def shown_quality(self) -> Quality:
-        """Return the quality without what is switched off."""
+        """Return the quality with the chosen methods, and without the methods of switched-off effects."""
         methods = dict(self.methods)
         if "relief" in self.off:
             methods["relight"] = "flat"
@@ -362,12 +362,15 @@ class Wanted:
         return self.quality.with_methods(**methods) if methods else self.quality
 
     def without_part(self, part: str, index: int) -> Wanted:
-        """Return this with one object, light or proxy removed; what is hidden stays hidden."""
+        """Return this state with one object, light or proxy removed; other hidden parts stay hidden."""
         hidden = frozenset((t, i - (t == part and i > index)) for t, i in self.hidden if (t, i) != (part, index))
         return dataclasses.replace(self, scene=_replaced(self.scene, part, index), hidden=hidden, materials=())
 
     def with_value(self, part: str, index: int, key: str, value: Any) -> Wanted:
-        """Return this with one value changed; an object that had a material of the chosen model gets that again."""
+        """Return this state with one value changed.
+
+        A change of a material's model restores the object's last material of that model, if it had one.
+        """
         scene = set_value(self.scene, part, index, key, value)
         if part != "object" or key != "model":
             return dataclasses.replace(self, scene=scene)
@@ -378,15 +381,15 @@ class Wanted:
         return dataclasses.replace(self, scene=_replaced(scene, "object", index, made), materials=kept)
 
     def with_part_shown(self, part: str, index: int, on: bool) -> Wanted:
-        """Return this with one object, light or proxy shown or hidden."""
+        """Return this state with one object, light or proxy shown or hidden."""
         item = {(part, index)}
         return dataclasses.replace(self, hidden=self.hidden - item if on else self.hidden | item)
 
     def with_method(self, stage: str, method: str) -> Wanted:
-        """Return this with a stage on another method than the preset's; an empty name goes back.
+        """Return this state with a chosen method for one stage; an empty name restores the preset's method.
 
         Raises:
-            UsageError: There is no such stage or method.
+            UsageError: The stage or the method does not exist.
         """
         known = {kind.name: kind.methods for kind in STAGES}
         if stage not in known or (method and method not in known[stage]):
@@ -395,7 +398,7 @@ class Wanted:
         return dataclasses.replace(self, methods=tuple(sorted((s, r) for s, r in methods.items() if r)))
 
     def with_effect(self, name: str, on: bool) -> Wanted:
-        """Return this with an effect switched."""
+        """Return this state with an effect switched on or off."""
         return dataclasses.replace(self, off=self.off - {name} if on else self.off | {name})
 
 
@@ -403,11 +406,11 @@ Edit = Callable[[Wanted], Wanted]
 
 
 def make_edit(command: Command, original: Wanted, seconds: float = 0.0) -> tuple[Edit, str] | None:
-    """Return the edit that a command asks for, and its name in words; None if the command is no edit.
+    """Return the edit of a command and its label; None if the command is not an edit.
 
     Args:
         command: Command of a page.
-        original: The scene before any edit.
+        original: State before any edit, to which ``reset`` returns.
         seconds: Time of the newest frame since the first.
     """
     fields = command.fields
@@ -439,7 +442,7 @@ def make_edit(command: Command, original: Wanted, seconds: float = 0.0) -> tuple
 
 
 def moved(value: _T, place: Callable[[Path], Path]) -> _T:
-    """Return a scene, or a part of one, with changed file paths."""
+    """Return a scene, or a part of one, with each file path replaced by ``place(path)``."""
     if isinstance(value, Path):
         return cast(_T, place(value))
     if isinstance(value, tuple) and list(files_of(value)):
@@ -452,12 +455,12 @@ def moved(value: _T, place: Callable[[Path], Path]) -> _T:
 
 
 def beside(scene: Scene, folder: Path) -> Scene:
-    """Return the scene with files in a folder named as if they lay beside its own file."""
+    """Return the scene with the paths of files in ``folder`` shortened to their names."""
     return moved(scene, lambda path: Path(path.name) if path.is_relative_to(folder) else path)
 
 
 def wanted_record(wanted: Wanted) -> dict[str, Any]:
-    """Return the record of a scene for the page, as plain data; of files only their names."""
+    """Return the state as plain data for the page; files are given by name without their folders."""
     scene = wanted.scene
 
     def plain(item: Any) -> dict[str, Any]:
@@ -500,7 +503,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 
 
 def _box(item: Object) -> npt.NDArray[np.float64]:
-    """Return the lowest and the highest corner of the box around an object that stands unturned at the origin."""
+    """Return the corners, (2, 3), of an object's bounding box before its rotation and translation, metres."""
     if (mesh := mesh_of(item)) is not None:
         return item.scale * mesh.bounds.astype(np.float64)
     wide = item.radius + item.major_radius + item.minor_radius
@@ -510,12 +513,12 @@ def _box(item: Object) -> npt.NDArray[np.float64]:
 
 
 def _reach(item: Object) -> float:
-    """Return the radius of a circle on the desk around an object's place, about its size, metres."""
+    """Return the mean horizontal extent of an object from its origin, metres."""
     return float(np.abs(_box(item)[:, :2]).mean())
 
 
 def _spot(item: Any) -> tuple[npt.NDArray[np.float64], float]:
-    """Return the middle and the radius of the circle on the desk that an object, a light or a ball takes up."""
+    """Return a circle on the desk that an object, light or ball occupies: its centre, (2,), and its radius, metres."""
     if isinstance(item, Probe):
         return np.array(item.center[:2]), item.radius
     if isinstance(item, Light):
@@ -526,9 +529,9 @@ def _spot(item: Any) -> tuple[npt.NDArray[np.float64], float]:
 
 
 def _apart(scene: Scene, item: Any) -> Any:
-    """Return a new object or light moved aside, along a spiral, where something stands at its place."""
+    """Return a new object or light, moved along a spiral until it overlaps no other."""
     if isinstance(item, Proxy) or (isinstance(item, Light) and item.kind == "directional"):
-        return item  # a shape of the desk is where it was pointed out, a sun far away
+        return item  # a proxy must stay on the surface that it models, and a directional light has no place
     alike = scene.lights if isinstance(item, Light) else (*scene.objects, *scene.probes)
     taken, (place, reach) = [_spot(one) for one in alike], _spot(item)
     for step in range(_PLACES):
@@ -546,7 +549,7 @@ def duplicate_part(scene: Scene, part: str, index: int) -> Scene:
 
 
 def snap_object(scene: Scene, index: int) -> Scene:
-    """Return the scene with an object's lowest point at the height of the marker, so that it stands on the desk."""
+    """Return the scene with an object moved vertically until its lowest point lies in the marker's plane."""
     item = _items(scene, "object", index)[index]
     mesh = mesh_of(item)
     points = np.array(list(itertools.product(*_box(item).T))) if mesh is None else item.scale * mesh.vertices

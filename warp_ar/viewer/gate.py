@@ -1,10 +1,10 @@
 """Admission of connections: silent and slow ones are closed, and cannot displace those that have sent the token.
 
-A connection is *admitted* once one whole request of it has passed the server's checks (its site, and the token where
-there is one). Until then it has ``HEADER_SECONDS``, the TLS handshake included; afterwards as long between requests,
-and as long as it likes on a WebSocket, which its heartbeat looks after. Places are counted in all and for each address.
-Where they are taken, the connection goes that has waited longest, those that are not admitted first: whoever opens
-many in silence cuts his own, and whoever sends his request at once comes in.
+A connection is *admitted* once one complete request of it has passed the server's checks of origin and token. It has
+``HEADER_SECONDS`` to do so, TLS handshake included, and as much time between later requests. WebSockets have no limit;
+their heartbeat finds dead ones. The number of connections is limited, in total and per address. At the limit, the
+connection that has waited longest is closed, and those not admitted go first. A client that opens many silent
+connections thus loses its own, and a client that sends its request at once is served.
 """
 
 from __future__ import annotations
@@ -24,40 +24,40 @@ from warp_ar.errors import say
 from warp_ar.viewer import protocol
 
 HEADER_SECONDS: Final = 10.0
-"""Longest time for a connection's handshake and a request's header, and longest rest between requests."""
+"""Longest time for a connection's handshake and a request's header, and longest pause between requests, seconds."""
 REQUEST_SECONDS: Final = 300.0
-"""Longest time for the answer to one request: a scene with its files over a phone's network."""
+"""Longest time for the answer to one request, seconds: enough for a scene with its files over a mobile network."""
 MOST_CONNECTIONS: Final = 96
-"""Connections in all; a page takes up to seven."""
+"""Largest number of connections; one page uses up to seven."""
 SHARE: Final = 0.25
-"""Largest share of the files that this process may open."""
+"""Largest number of connections, as a fraction of the files that this process may open."""
 MOST_PER_ADDRESS: Final = 24
 ACCEPTED_PER_SECOND: Final = 150.0
-"""Connections taken from the system's queue; each takes 0.2 ms, over TLS two."""
+"""Connections accepted per second; each takes 0.2 ms, over TLS 2 ms."""
 BACKLOG: Final = 64
-"""Connections that wait in the system's queue."""
+"""Connections that may wait in the system's queue."""
 FULL_SECONDS: Final = 0.2
-"""Rest where the process has no file left for another connection."""
+"""Pause after the process has run out of file descriptors, seconds."""
 SWEEP_SECONDS: Final = 0.5
 TOLD_SECONDS: Final = 60.0
-"""Shortest time between two lines about connections that were cut."""
+"""Shortest time between two messages about closed connections, seconds."""
 
 
 class Connection(web.RequestHandler):
-    """HTTP of one connection, and its place at the gate."""
+    """HTTP handler of one connection, with the connection's deadline and state of admission."""
 
     def __init__(self, gate: Gate, taken: socket.socket, address: str, **options: Any) -> None:
         super().__init__(gate.server, loop=asyncio.get_running_loop(), **options)
         self.gate, self.socket, self.address = gate, taken, address
         self.deadline = time.monotonic() + gate.header_seconds
-        """Time at which it is cut, seconds of ``time.monotonic``."""
+        """Time at which the connection is closed, seconds of ``time.monotonic``."""
         self.handshake: asyncio.Task[None] | None = None
         self.admitted = False
         self.answering = False
-        """True while a request of it is answered."""
+        """True while one of its requests is being answered."""
 
     def cut(self) -> None:
-        """Close it without waiting for its other end."""
+        """Close the connection without waiting for the client."""
         self.gate.connections.pop(self, None)
         if self.transport is not None:
             self.transport.abort()
@@ -65,16 +65,16 @@ class Connection(web.RequestHandler):
             self.handshake.cancel()
 
     def connection_lost(self, exc: BaseException | None) -> None:
-        """Leave the gate."""
+        """Remove the connection from the gate."""
         self.gate.connections.pop(self, None)
         super().connection_lost(exc)
 
     def handle_error(
         self, request: Any, status: int = 500, exc: BaseException | None = None, message: str | None = None
     ) -> web.StreamResponse:
-        """Answer an error with the headers of all answers."""
+        """Return the answer to a failed request, with the headers of all answers."""
         if status < 500:
-            # Requests that are no HTTP are their sender's affair, and no line of the log.
+            # A request that is not HTTP is the client's fault and is not logged.
             answer: web.StreamResponse = web.Response(status=status, text="not understood\n")
             answer.force_close()
         else:
@@ -83,7 +83,7 @@ class Connection(web.RequestHandler):
         return answer
 
     def log_exception(self, *args: Any, **options: Any) -> None:
-        """Log an exception, unless it is of a body that is not what its header says."""
+        """Log an exception, unless its cause is a request body that contradicts the request's header."""
         if not isinstance(options.get("exc_info"), web.RequestPayloadError):
             super().log_exception(*args, **options)
 
@@ -99,18 +99,18 @@ def file_limit() -> int:
 
 
 class Gate:
-    """Takes connections for a server and looks after them. All of it runs on the event loop."""
+    """Acceptor of a server's connections, which enforces the limits. All methods run on the event loop."""
 
     def __init__(self, headers: dict[str, str], *, header_seconds: float = HEADER_SECONDS) -> None:
-        """Set the bounds.
+        """Set the limits.
 
         Args:
-            headers: Of every answer that the server itself does not give.
-            header_seconds: As ``HEADER_SECONDS``.
+            headers: Headers of the answers to malformed requests.
+            header_seconds: Limit in place of ``HEADER_SECONDS``.
         """
         self.headers, self.header_seconds = headers, header_seconds
         self.connections: dict[Connection, None] = {}
-        """All connections; the one that has waited longest comes first."""
+        """All connections, the one that has waited longest first."""
         self.server: Any = None
         self._tls: ssl.SSLContext | None = None
         self._most = min(MOST_CONNECTIONS, max(int(SHARE * file_limit()), 8))
@@ -121,7 +121,7 @@ class Gate:
         self._told = 0.0
 
     def start(self, server: web.Server, listener: socket.socket, tls: ssl.SSLContext | None) -> None:
-        """Take connections from a socket that listens."""
+        """Accept connections from a listening socket."""
         self.server, self._tls, self._listener = server, tls, listener
         listener.setblocking(False)
         self._spawn(self._accept(listener))
@@ -134,7 +134,7 @@ class Gate:
         return task
 
     async def close(self) -> None:
-        """Take no more connections, and cut those that are left."""
+        """Accept no more connections, and close the open ones."""
         if self._listener is not None:
             asyncio.get_running_loop().remove_reader(self._listener)
         for task in tuple(self._tasks):
@@ -154,7 +154,7 @@ class Gate:
             try:
                 taken, address = await asyncio.get_running_loop().sock_accept(listener)
             except OSError as error:
-                # Nothing left to open files with, or a connection that was gone again.
+                # Out of file descriptors or memory; or the client has left again.
                 if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                     self._evict(list(self.connections))
                     await asyncio.sleep(FULL_SECONDS)
@@ -167,7 +167,7 @@ class Gate:
             self._make_room(connection)
 
     async def _hand_over(self, connection: Connection) -> None:
-        """Speak HTTP with a connection, after the handshake where there is one."""
+        """Start HTTP on a connection, after its TLS handshake if TLS is used."""
         patience: dict[str, Any] = {}
         if self._tls is not None:
             patience = {"ssl_handshake_timeout": self.header_seconds, "ssl_shutdown_timeout": 1.0}
@@ -179,14 +179,19 @@ class Gate:
 
     @staticmethod
     def connection_of(request: web.Request) -> Connection:
-        """Return the connection that a request came by."""
+        """Return the connection of a request."""
         connection = request.protocol
         assert isinstance(connection, Connection)
         return connection
 
     @contextlib.contextmanager
     def answering(self, request: web.Request, *, admitted: bool) -> Iterator[None]:
-        """Keep a connection while a request of it is answered; ``admitted``: that request shows that it may be here."""
+        """Protect a connection from being closed while its request is answered.
+
+        Args:
+            request: The request.
+            admitted: True if the request has passed the checks that admit its connection.
+        """
         connection = self.connection_of(request)
         connection.admitted |= admitted
         connection.answering, connection.deadline = True, time.monotonic() + REQUEST_SECONDS
@@ -206,7 +211,7 @@ class Gate:
             self._evict(everyone, newest)
 
     def _evict(self, among: list[Connection], newest: Connection | None = None) -> None:
-        """Cut who has waited longest, and say now and then that connections are being cut."""
+        """Close the connection that has waited longest, and report closed connections at most once a minute."""
         resting = [other for other in among if not other.answering and other is not newest] or among[-1:]
         if resting:
             min(resting, key=lambda other: other.admitted).cut()  # the first of equals
@@ -220,4 +225,4 @@ class Gate:
             await asyncio.sleep(SWEEP_SECONDS)
             now = time.monotonic()
             for connection in [one for one in self.connections if one.deadline < now]:
-                connection.cut()  # a browser's spare connection, or one that rests between requests: nothing to tell
+                connection.cut()  # usually a browser's spare connection, or an idle one: nothing worth a message

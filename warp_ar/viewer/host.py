@@ -1,4 +1,4 @@
-"""Host of the page: executes viewers' commands, lights frames, and makes files for download."""
+"""Host of the page: executes viewers' commands, renders frames, and makes files for download."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ from warp_ar.viewer.setup import CalibrationSession, SetupChecks, card_pdf, page
 from warp_ar.viewer.uploads import DroppedFiles, pack_scene
 
 PLAY_RATE: Final = 30.0
-"""Frames a second of clips that tell no rate."""
+"""Frame rate assumed at a change of source: the new source's frames start 1 / PLAY_RATE s after the last frame."""
 _LIGHT_SECONDS: Final = 0.25
-"""Time between two looks at the environment."""
+"""Shortest time between two copies of the environment to the host, seconds."""
 _MEASURING_REST: Final = 0.15
-"""Seconds that the frames rest, one from the next, while methods are timed: what runs beside them spoils the times."""
+"""Pause between frames while methods are timed, as concurrent work distorts the times, seconds."""
 _STILL_SECONDS: Final = 0.25
-"""Time after which a held frame is looked at again, where nothing was edited."""
+"""Time between renderings of a held frame without edits, seconds."""
 _BUILDING_SECONDS: Final = 0.03
-"""Time after which it is looked at again while a pipeline is built."""
+"""Time between renderings of a held frame while a pipeline is built, seconds."""
 _NOTICE_SECONDS: Final = 5.0
-"""Shortest time between two notices of frames that cannot be lit."""
+"""Shortest time between two notices of frames that cannot be lit, seconds."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,29 +66,29 @@ class Lit:
     id: int
     """Number of the frame since the page was started."""
     taken: float
-    """Time of its capture, or for a recorded frame the time at which it was due, seconds of ``time.monotonic``."""
+    """Time of capture, or for a recorded frame the time at which it was due, seconds of ``time.monotonic``."""
     stamp: float | None
-    """Time at which a browser's camera took it, milliseconds of the browser's own clock; None from other sources."""
+    """Time of capture by a browser's camera, milliseconds on the browser's own clock; None from other sources."""
     image: Image
-    """Lit, uint8 RGB; the camera's own where nothing can light it yet."""
+    """Lit picture, uint8 RGB; the camera's picture while no pipeline is ready."""
     other: Image | None
-    """Picture that it is compared with."""
+    """Picture to compare with."""
     frame: Image
-    """Frame of the camera."""
+    """Picture of the camera."""
     pose: Pose | None
     """``camera_from_world``."""
     state: TrackState | None
     camera: Camera
     stages: tuple[tuple[str, float, bool], ...]
-    """Name, milliseconds, and True if it was skipped."""
+    """(name, milliseconds, True if the stage was skipped) of each stage."""
     light_ms: float
-    """Milliseconds from the received to the lit frame."""
+    """Time to render the frame, milliseconds."""
     plan: int
-    """Number of the plan that it was lit by; 0 where it was not."""
+    """Number of the plan that lit the frame; 0 if none did."""
 
 
 class Host:
-    """Frames controlled by viewers.
+    """Renderer of frames as viewers request them.
 
     Every method may be called from any thread, except ``run``, which lights the frames.
     """
@@ -110,18 +110,18 @@ class Host:
 
         Args:
             scene: The scene to begin with.
-            source: Frames instead of the scene's own.
+            source: Source of frames that replaces the scene's own.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            quality: A preset's name, a value, or ``auto``.
+            quality: A preset's name, a ``Quality``, or ``auto``.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
-            frames: End after so many lit frames.
-            by_card: Light the scene by the card as soon as frames show it.
-            publish: Takes every frame, on the host's own thread.
-            notify: Takes other news for viewers, on any thread.
+            frames: Number of lit frames after which ``run`` ends; None sets no end.
+            by_card: True lights the scene by the printed card as soon as frames show it.
+            publish: Receiver of every frame, called on the thread of ``run``.
+            notify: Receiver of other messages for viewers, called on any thread.
 
         Raises:
-            WarpArError: The source cannot be opened, or no plan be made for it. A capture device that is not there is
-                waited for, unless ``frames`` are counted: a viewer may bring a camera.
+            WarpArError: The source cannot be opened, or no plan can be made for it. An absent capture device is an
+                error only if ``frames`` is given; otherwise a viewer may use its own camera.
         """
         self._given_source = source
         self._budget = BudgetSetting(notify)
@@ -150,17 +150,17 @@ class Host:
         self._base = self._at = self._busy_ms = 0.0
         self._light_time = self._notice_time = 0.0
         self.seconds = 0.0
-        """Time of the newest lit frame since the first: the time of animations."""
+        """Time of the newest lit frame since the first, seconds: the time of animations."""
         self._times: collections.deque[float] = collections.deque(maxlen=60)
         self._compared = ""
         self._hits: tuple[Any, Scene] | None = None
-        """Shape that each pixel of the newest frame shows, and the scene of these shapes."""
+        """Index of the shape in each pixel of the newest frame, and the scene that these indices refer to."""
         self.convergence = Convergence()
-        """The reference of a held frame."""
+        """Reference of a held frame."""
         self.latest: Lit | None = None
-        """The newest frame."""
+        """Newest frame."""
         self.light_state: LightState | None = None
-        """The environment a moment ago, with its status; None while unknown."""
+        """Newest copy of the environment with its status; None while unknown."""
         if by_card:
             self._setup.step("light")
         self._dropped, self._dropping = DroppedFiles(folder), threading.Lock()
@@ -177,40 +177,40 @@ class Host:
             "setup": self._setup.step,
         }
         self.stop = controls.stop
-        """End ``run`` after the frame in hand."""
+        """End ``run`` after the present frame."""
         self.watch = controls.watch
-        """Count one viewer more (1) or less (-1): without any, no frame is lit."""
+        """Count one viewer more (1) or less (-1). Frames are lit only while there is a viewer."""
         self.push, self.camera_size = self._camera.push, self._camera.size
-        """Take a picture of a browser's camera; size of the pictures that a viewer may push."""
+        """Queue a picture of a browser's camera; return the size of pictures that a viewer may push."""
         self.scene_message, self.plan_message = controls.scene_message, self._lighting.plan_message
-        """Messages of the scene as it is edited, and of the stages that run."""
+        """Return the message of the edited scene; return the message of the running stages."""
 
-    # ------------------------------------------------------------------------------------------------- what viewers ask
+    # ------------------------------------------------------------------------------------------------ viewers' commands
 
     @property
     def no_camera(self) -> NoCamera | None:
-        """The source that stands for an absent camera; None while there are frames."""
+        """Substitute source of an absent camera; None while there are frames."""
         source = self._controls.feed.source
         return source if isinstance(source, NoCamera) else None
 
     @property
     def description(self) -> str:
-        """The source in one line, without its folder."""
+        """Description of the source in one line; files are named without their folders."""
         return self._controls.feed.source.description.rsplit("/", 1)[-1]
 
     def wanted(self) -> Wanted:
-        """Return the state that viewers see now, or will once it is built."""
+        """Return the state that viewers see, at the latest once its pipeline is built."""
         return self._controls.wanted
 
     def edit(self, command: Command, owner: object = None) -> None:
         """Carry out a command of a page.
 
         Args:
-            command: Command, checked.
-            owner: Viewer that asks; matters for the camera only.
+            command: Checked command.
+            owner: Viewer that sent the command; used only by commands for its camera.
 
         Raises:
-            WarpArError: It cannot be done; nothing has changed.
+            WarpArError: The command cannot be carried out; nothing has changed.
         """
         if (made := edits.make_edit(command, self._original, self.seconds)) is not None:
             self._controls.change(*made)
@@ -226,8 +226,8 @@ class Host:
         self._set_budget(self._budget.last_budget if name == AUTO else None, name)
 
     def _set_budget(self, ms: float | None, preset: str | None = None) -> None:
-        """Keep to a budget, or with None show a preset: the last one that was chosen, if none is named."""
-        with self._controls.changed:  # of two viewers who ask at once, both parts are those of one
+        """Set a budget, milliseconds per frame, or with None use a preset: the named one, else the last chosen one."""
+        with self._controls.changed:  # so that two viewers' changes of budget and quality cannot mix
             if ms is None:
                 quality = self._preset = resolve_quality(preset or self._preset.name)
             else:
@@ -237,7 +237,7 @@ class Host:
             self._controls.change(lambda w: dataclasses.replace(w, quality=quality))
 
     def _point_out(self, kind: str, points: tuple[tuple[float, float], ...]) -> None:
-        """Model a part of the desk that four points of the newest frame outline."""
+        """Add a proxy for the part of the desk that four points of the newest frame outline, pixels."""
         lit = self.latest
         if lit is None or lit.pose is None:
             raise UsageError("the marker is not seen, so no point of the picture has a place: show it first")
@@ -265,39 +265,42 @@ class Host:
     # ----------------------------------------------------------------------------------------------- the page's camera
 
     def leave_camera(self, owner: object) -> None:
-        """Go back to the scene's own source, if ``owner``'s camera is the source."""
+        """Return to the scene's own source if the camera of the viewer ``owner`` is the source."""
         if not self._camera.is_of(owner):
             return
         scene = self._controls.wanted.scene
         try:
             feed = open_feed(scene, self._given_source)
         except WarpArError as error:
-            # Such as a scene without a source, or one whose file has gone: others may bring a camera.
+            # For example a scene without a source, or with a deleted file. Another viewer may use its camera.
             self._notify(failure(error))
             absent = error if isinstance(error, SourceError) else SourceError(str(error))
             feed = Feed(NoCamera((scene.camera.width, scene.camera.height), absent))
         self._controls.switch(feed)
 
     def drop(self, name: str, data: bytes) -> str:
-        """Take a file that a viewer dropped onto the picture; return the words about it.
+        """Add a file that a viewer dropped onto the picture to the scene.
+
+        Returns:
+            Description of the change, for the viewer.
 
         Raises:
-            WarpArError: It cannot be used; nothing has changed.
+            WarpArError: The file cannot be used; nothing has changed.
         """
         with self._dropping:
             make, label, words = self._dropped.take(name, data, self._controls.wanted)
             self._controls.change(make, label)
         return words
 
-    # ------------------------------------------------------------------------------------------------ what can be saved
+    # -------------------------------------------------------------------------------------------------------- downloads
 
     def downloads(self, *, full_paths: bool) -> dict[str, tuple[str, Callable[[], bytes]]]:
-        """Return the type and the maker of every file that can be saved, by its name.
+        """Return a dictionary from file name to (media type, function that makes the content).
 
-        A maker raises a WarpArError where there is no such file yet.
+        The function raises a WarpArError if the content does not exist yet.
 
         Args:
-            full_paths: Write the paths of a scene's files in full, as for ``scene_toml``.
+            full_paths: True writes full paths of a scene's files, see ``scene_toml``.
         """
         return {
             "frame.png": ("image/png", self.snapshot),
@@ -317,7 +320,7 @@ class Host:
         """Return the newest frame as a PNG.
 
         Raises:
-            UsageError: There was none.
+            UsageError: No frame has been lit yet.
         """
         if (latest := self.latest) is None:
             raise UsageError("no frame has been lit yet")
@@ -327,7 +330,7 @@ class Host:
         """Return the environment as an EXR.
 
         Raises:
-            UsageError: It is not known.
+            UsageError: The environment is not known.
         """
         if (state := self.light_state) is None:
             raise UsageError(
@@ -336,21 +339,22 @@ class Host:
         return encode_picture(state, "exr", "z-up", "latlong", None)
 
     def scene_toml(self, *, full_paths: bool) -> str:
-        """Return the scene as it is shown, as a scene file.
+        """Return the shown scene as the text of a scene file.
 
         Args:
-            full_paths: Write the paths of files in full; else relative to the scene's folder where they lie in it.
+            full_paths: True writes full paths of files; False writes them relative to the scene's folder if they lie
+                in it.
         """
         scene = make_target(self._controls.wanted, self._controls.feed).scene
-        # What was measured or dropped here is saved beside the scene.
+        # Measured and dropped files are named as files of the scene's own folder, where users will save them.
         scene = edits.beside(scene, Path(self._folder.name))
         folder = None if full_paths or scene.path is None else scene.path.parent
         return dumps_scene(dataclasses.replace(scene, path=None), folder)
 
-    # ---------------------------------------------------------------------------------------------------- what is told
+    # --------------------------------------------------------------------------------------------------------- messages
 
     def greetings(self) -> list[dict[str, Any]]:
-        """Return all that a new viewer should know."""
+        """Return the messages for a new viewer."""
         return [
             self.plan_message(),
             self.scene_message(),
@@ -361,7 +365,7 @@ class Host:
         ]
 
     def state_message(self) -> dict[str, Any]:
-        """Return the message of all that changes by itself."""
+        """Return the message of values that change without a viewer's command."""
         controls, lighting, budget = self._controls, self._lighting, self._budget
         return {
             "type": "state",
@@ -385,7 +389,7 @@ class Host:
 
     def _missing(self) -> dict[str, str] | None:
         """Return the reason for missing frames, a marker that is not visible, or objects outside the picture."""
-        absent = self.no_camera  # once: another source may come meanwhile
+        absent = self.no_camera  # read once, as another thread may change the source
         return self._setup.guide() if absent is None else page_record(absent.finding)
 
     def _lens(self) -> str:
@@ -399,14 +403,14 @@ class Host:
         return "given" if wanted.scene.camera.field_of_view is None else "guessed"
 
     def close(self, *, wait_seconds: float | None = None, frames_ended: bool = True) -> bool:
-        """Let the source, the pipelines and all temporary files go.
+        """Close the source and the pipelines, and delete all temporary files.
 
         Args:
             wait_seconds: Longest wait for pipelines that are being built; None waits until they are.
-            frames_ended: False while ``run`` is at a frame still: its pipeline is left to it.
+            frames_ended: False while ``run`` still renders a frame; pipelines are then not closed.
 
         Returns:
-            True if all threads have ended; others end after their work in hand.
+            True if all threads have ended. Remaining threads end after their present task.
         """
         self._budget.stopped = True
         self._controls.close()
@@ -419,23 +423,26 @@ class Host:
     # ---------------------------------------------------------------------------------------------------------- frames
 
     def _use_calibrated(self, camera: Camera) -> None:
-        transfer = self._controls.camera_of(self._controls.feed).transfer  # which a board does not tell
+        transfer = self._controls.camera_of(self._controls.feed).transfer  # a board does not measure it
         camera = dataclasses.replace(camera, transfer=transfer)
         self._controls.change(lambda w: w.with_camera(camera), "calibrate the camera")
 
     @property
     def fps(self) -> float:
-        """Frames a second over the last ones."""
+        """Mean frame rate of the last 60 frames, 1 / s."""
         times = list(self._times)
         return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
 
     def pick(self, x: float, y: float, reach: float) -> int | None:
-        """Return the number of the object that the newest frame shows at a pixel, or nearest to it; from any thread.
+        """Return the index of the object at a pixel of the newest frame, or nearest to it. From any thread.
 
         Args:
             x: Column of the pixel; centres lie at integers.
             y: Row of the pixel.
-            reach: Largest distance of a pixel that shows the object, pixels.
+            reach: Largest distance from the pixel to the object, pixels.
+
+        Returns:
+            Index of the object; None if none is within reach.
         """
         if self._hits is None:
             return None
@@ -451,12 +458,12 @@ class Host:
         nearest = distances.argmin()
         wanted = self._controls.wanted
         shown = [index for index in range(len(wanted.scene.objects)) if ("object", index) not in wanted.hidden]
-        # Pixels know shapes: an object that its file moves in parts has several.
+        # Pixels hold indices of shapes. An object that its file moves in parts has several shapes.
         number = object_shapes(scene)[near[rows[nearest], columns[nearest]]].index
         return shown[number] if number < len(shown) else None
 
     def run(self) -> None:
-        """Light frames until told to stop. A failure of a source is told to the viewers; another source may follow."""
+        """Light frames until ``stop`` is called. After a failure of a source, notify viewers and await another one."""
         controls = self._controls
         while not controls.stopped:
             try:
@@ -475,11 +482,11 @@ class Host:
             self._notify(notice(words))
         for frame in source:
             if still is None or frame.exposure_time in (None, *source.exposures[:1]):
-                still = frame  # a held picture is one of those that are shown
+                still = frame  # of a bracket's frames, only those of the shown exposure can be held
             if start is None:
                 start = self._base - frame.time  # the pipeline's clock never runs back
             if not source.live:
-                # A recorded frame waits until it is due; one that is late moves all that follow.
+                # A recorded frame waits until it is due. A late frame delays all that follow.
                 due = max(due + max(frame.time - previous, 0.0), time.monotonic())
                 previous = frame.time
                 self._controls.wait(max(due - time.monotonic(), 0.0))
@@ -490,7 +497,11 @@ class Host:
                 return
 
     def _hold(self, frame: Frame, now: float) -> bool:
-        """Rest while nobody watches; while held, light the same frame again after edits. False to leave the source."""
+        """Wait without viewers; while the page holds a frame, light it again after edits.
+
+        Returns:
+            False if the source shall be left, True to continue with the next frame.
+        """
         controls = self._controls
         while True:
             with controls.changed:
@@ -507,12 +518,12 @@ class Host:
                     timeout=self._rest(idle),
                 )
             if controls.watchers == 0:
-                self._lighting.follow()  # the wanted pipeline is to be there when somebody comes
+                self._lighting.follow()  # the wanted pipeline should be ready for the next viewer
             elif not controls.playing and not (self._converge() or self._light_frame(frame, now)):
                 return False
 
     def _rest(self, idle: bool) -> float | None:
-        """Return seconds until a held frame is looked at again; None waits for somebody to come."""
+        """Return the seconds until a held frame is rendered again; None waits for a viewer."""
         if idle and not self._lighting.busy:
             return None
         if not idle and self._progress() == "running":
@@ -520,19 +531,22 @@ class Host:
         return _BUILDING_SECONDS if self._lighting.busy else _STILL_SECONDS
 
     def _held(self) -> tuple[Wanted, int, float]:
-        """Return the identity of a held picture, the frame's own time included; the reference of another is dropped."""
+        """Return the key of the held picture: state, plan and time. A reference of another key is outdated."""
         return self._controls.wanted, self._plan, self._at
 
     def _progress(self) -> str:
-        """Return the reference's progress for the held frame; empty where none is asked for, or lighting changes."""
+        """Return the progress of the held frame's reference; empty if none is requested or the lighting changes."""
         controls, latest = self._controls, self.latest
         asked = controls.compare in CONVERGING and not controls.playing and latest is not None and latest.plan != 0
         return self.convergence.progress(self._held()) if asked and not self._lighting.changing else ""
 
     def _converge(self) -> bool:
-        """Add a slice of samples, and hand out the picture; False where the frame is to be lit instead.
+        """Add a slice of samples to the reference and publish the pictures.
 
-        At rest the picture stays that of the reference: lit again, it would have light that came in meanwhile.
+        The lit picture is kept, because a new one would use light that was captured after the reference began.
+
+        Returns:
+            False if the frame must be lit instead.
         """
         progress, compare, latest = self._progress(), self._controls.compare, self.latest
         if latest is None or not progress:
@@ -552,7 +566,7 @@ class Host:
         return True
 
     def _compare_with(self, pipeline: Pipeline, frame: Frame, result: Result, now: float) -> Image | None:
-        """Return the picture that the lit one is compared with."""
+        """Return the picture to compare with the lit one; None if there is none yet."""
         controls, lighting = self._controls, self._lighting
         converges = controls.compare in CONVERGING
         if not converges or controls.playing or lighting.changing:
@@ -568,11 +582,11 @@ class Host:
         return other
 
     def _light_frame(self, frame: Frame, now: float) -> bool:
-        """Light one frame and hand it out; False to leave the source."""
+        """Light one frame and publish it; return False if the source shall be left."""
         if self._controls.leaving:
             return False
         begin = time.perf_counter()
-        self._at = now  # seconds on the pipeline's clock, which never runs back: another frame has another
+        self._at = now  # seconds on the pipeline's clock, which never runs back: unique for each frame
         pushed = self._camera.begin(frame.image, self._busy_ms)
         plain = self._plain(frame, pushed)
         self._calibration.look(frame.image)
@@ -600,9 +614,10 @@ class Host:
         return True
 
     def _tell_failure(self, error: Exception) -> None:
-        """Tell why a frame is not lit. After a fault, the edit since the last lit frame is taken back.
+        """Notify viewers of a frame that cannot be lit, and undo the edit that caused the failure.
 
-        An error of the program's own, such as of an exposure that was not announced, says nothing of the edit.
+        Only an unexpected exception undoes the edit since the last lit frame. A ``WarpArError``, for example of an
+        unannounced exposure time, concerns the frame and not the edit.
         """
         taken_back = not isinstance(error, WarpArError) and self._lighting.take_back()
         if taken_back or time.monotonic() - self._notice_time > _NOTICE_SECONDS:
@@ -636,13 +651,13 @@ class Host:
         )
 
     def _plain(self, frame: Frame, pushed: Pushed | None) -> Lit:
-        """Return a frame as the camera gave it, for viewers to see meanwhile; it is stamped here, before lighting."""
+        """Return the unlit record of a frame, with its number and time of capture."""
         self._id += 1
         taken, stamp = time.monotonic(), None
         if pushed is not None:
             taken, stamp = pushed.taken, pushed.stamp
         elif self._controls.feed.source.live and self._controls.playing:
-            taken = self._controls.feed.source.start + frame.time  # a frame that waited for the one before is older
+            taken = self._controls.feed.source.start + frame.time  # earlier than now if the frame has waited
         camera = self._controls.camera_of(self._controls.feed)
         size = frame.image.shape[1], frame.image.shape[0]
         if (camera.width, camera.height) != size:
@@ -666,16 +681,16 @@ class Host:
             exposure = 1.0 if scale is None else float(scale.numpy()[0])
         known = arrays.get("recover_status", dict)()
         places = tuple(probe.center for probe in pipeline.scene.probes[: len(others) + 1])
-        seen = values.any()  # black until the ball has been seen once
+        seen = values.any()  # the map is black until the ball has been seen once
         self.light_state = LightState(values, exposure, known, others, places) if seen else None
 
     def _watch_cost(self, pipeline: Pipeline, frame: Frame, result: Result, light_ms: float) -> None:
-        """Learn what the preset costs; under a budget, choose the methods that it asks for."""
+        """Record the frame's time as the preset's cost; under a budget, change to the methods that it chooses."""
         if not result.shown or (result.pose is None and pipeline.plan.needs("pose")):
             return
         controls, budget = self._controls, self._budget
         wanted = controls.wanted
-        # A held frame changes nothing, a pipeline on its way out says nothing about the next one.
+        # Times of held frames, and of a pipeline that is about to be replaced, are not representative.
         steady = not self._lighting.changing and controls.playing and pipeline.quality == wanted.shown_quality()
         budget.look(pipeline, frame.image, result.pose, self._lighting.builder)
         chosen = budget.observe(wanted.quality.name, light_ms if steady else None)

@@ -1,4 +1,7 @@
-"""Content of ``/light.json``: harmonics of the environment, its strongest emitter, and recovery status. Loads Warp."""
+"""Content of ``/light.json``: harmonics of the environment, its strongest emitter, and recovery status.
+
+Importing this module loads Warp.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +28,15 @@ class LightState:
     """Light at one moment."""
 
     radiance: npt.NDArray[np.float32]
-    """Latlong in this program's axes, linear RGB in camera values, (rows, columns, 3)."""
+    """Latlong map in the marker's axes (z up), linear RGB in camera values, (rows, columns, 3)."""
     exposure: float
     """Factor on the picture's radiance."""
     recovery: Mapping[str, Any]
-    """Status of ``recover``; empty where it does not run."""
+    """Status of the stage ``recover``; empty if the stage does not run."""
     others: tuple[npt.NDArray[np.float32], ...] = ()
-    """The same light at each mirror ball after the first, where it is interpolated."""
+    """Latlong maps of the other mirror balls, if light is interpolated between balls."""
     places: tuple[tuple[float, float, float], ...] = ()
-    """Centres of all those balls, the first one too, metres in the marker's frame."""
+    """Centres of the balls, the first included, metres in the marker's frame."""
 
 
 def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
@@ -45,7 +48,7 @@ def describe(state: LightState, pose: Pose | None, axes: str) -> dict[str, Any]:
         axes: One of ``AXES``.
 
     Raises:
-        UsageError: There are no such axes.
+        UsageError: ``axes`` is not one of ``AXES``.
     """
     check_axes(axes)
     turn = world_from_marker(axes)
@@ -74,10 +77,10 @@ def _describe_ball(radiance: npt.NDArray[np.float32], turn: npt.NDArray[np.float
 
 
 def key_light(radiance: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) -> dict[str, Any] | None:
-    """Return the strongest emitter: direction, irradiance, extent and directionality; None if there is none.
+    """Return the strongest emitter: direction, irradiance, solid angle and directionality; None if there is none.
 
-    ``directionality`` is clamp(2 V . s / phi, 0, 1) with the flow V = integral of L d and phi = integral of L: 0 where
-    light comes from everywhere, 1 for a sun in the dark.
+    ``directionality`` is clamp(2 V . s / phi, 0, 1) with the emitter's direction s, the flow V = integral of L d and
+    phi = integral of L. It is 0 for uniform light and 1 for a single small emitter in the dark.
     """
     found = find_emitters(radiance, np.zeros_like(radiance), 0.0)
     if not found:
@@ -97,7 +100,7 @@ def key_light(radiance: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) 
 
 
 def _interval(recovery: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return irradiance along the marker's axes and its interval; None where light is not recovered."""
+    """Return the irradiance along the marker's axes with its interval; None if clipped light is not recovered."""
     if "irradiance_value" not in recovery:
         return None
     values = {name: recovery[f"irradiance_{name}"] for name in ("low", "value", "high")}
@@ -105,7 +108,7 @@ def _interval(recovery: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def encode_picture(state: LightState, kind: str, axes: str, layout: str, size: int | None, ball: int = 0) -> bytes:
-    """Return the environment at a ball as ``exr`` or ``hdr``; arguments and errors as those of `write_environment`."""
+    """Return the environment at a ball as ``exr`` or ``hdr``; see `write_environment` for arguments and errors."""
     radiance = _at_ball(state, ball)
     return written(f"light.{kind}", lambda path: write_environment(path, radiance, axes=axes, layout=layout, size=size))
 
@@ -118,7 +121,7 @@ def _at_ball(state: LightState, ball: int) -> npt.NDArray[np.float32]:
 
 
 def encode_face(state: LightState, axes: str, size: int | None, face: str, ball: int = 0) -> bytes:
-    """Return one face of the cube, of ``FACES``, as HDR; arguments and errors as those of `to_cube`."""
+    """Return one face of the cube map, one of ``FACES``, as HDR; see `to_cube` for arguments and errors."""
     check_axes(axes, "cube")
     column = to_cube(_at_ball(state, ball), axes, size)
     edge, number = column.shape[1], FACES.index(face)
@@ -127,7 +130,7 @@ def encode_face(state: LightState, axes: str, size: int | None, face: str, ball:
 
 
 def written(name: str, write: Callable[[Path], object]) -> bytes:
-    """Return what ``write`` writes into a file of that name, which is gone afterwards."""
+    """Return the bytes that ``write`` writes into a temporary file of that name."""
     with tempfile.TemporaryDirectory(prefix="warp_ar_live_") as folder:
         path = Path(folder) / name
         write(path)

@@ -1,7 +1,7 @@
-"""Pipelines of the page: one lights the frames, another the comparison picture; both follow the wanted state.
+"""Pipelines of the page: one renders the frames, another the comparison picture; both follow the wanted state.
 
 The reference of a held frame is path-traced in slices of samples, with the light, pose and scene of the last lit frame.
-Any change (new frames, an edit, another plan) drops it, and the next held frame starts again.
+Any change (new frames, an edit, another plan) drops the reference, and the next held frame starts a new one.
 """
 
 from __future__ import annotations
@@ -38,22 +38,25 @@ from warp_ar.viewer.protocol import Notify, failure, notice
 FIRST: Final = dataclasses.replace(
     PRESETS["low"].with_methods(recover="white_card", environment_shadow="none"), name="the first picture"
 )
-"""Quality until the wanted plan is built: ``low`` without what takes long to compile."""
+"""Quality until the wanted plan is built: ``low`` without the methods that take long to compile."""
 _AS_QUICK: Final = ("low", "paper")
-"""Presets that are not worth waiting for in two steps."""
+"""Presets that are built directly, as they take no longer than ``FIRST``."""
 
 
 def make_target(wanted: Wanted, feed: Feed) -> Target:
-    """Return the target that a pipeline is built for."""
+    """Return the scene, quality, size, outputs and exposures for which a pipeline is built."""
     camera = wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
     scene = dataclasses.replace(wanted.shown_scene(), camera=camera)
-    # The page draws handles where parts are: that takes the pose, even where no stage does.
+    # The page draws handles on objects and lights, which needs the pose even if no stage does.
     outputs = ("image", "pose") if wanted.scene.objects or wanted.scene.lights else ("image",)
     return Target(scene, wanted.shown_quality(), feed.source.size, outputs, feed.source.exposures)
 
 
 class Lighting:
-    """Pipelines that follow the wanted state. Called by the frames' thread; properties may be read by any thread."""
+    """Pipelines that follow the wanted state.
+
+    Methods are called by the thread of the frames; properties may be read by any thread.
+    """
 
     def __init__(self, controls: Controls, device: str, notify: Notify, give_up: Callable[[], None]) -> None:
         """Start without a pipeline.
@@ -61,16 +64,16 @@ class Lighting:
         Args:
             controls: State that viewers want to see.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            notify: Takes news for viewers.
-            give_up: Called when what is wanted cannot be built, before what was good is wanted again.
+            notify: Receiver of messages for viewers.
+            give_up: Function called when the wanted pipeline cannot be built, before the last good state is restored.
 
         Raises:
-            UsageError: There is no such device.
+            UsageError: The device does not exist.
             SceneError: The scene does not fit the source.
         """
         self._controls, self._notify, self._give_up = controls, notify, give_up
         self.device = str(resolve_device(device))
-        # What no plan can be made for is refused before anything is shown.
+        # A plan is made at once, so that an impossible request fails before anything is shown.
         target = make_target(controls.wanted, controls.feed)
         assert target.size is not None
         camera = target.scene.camera.scaled_to(*target.size)
@@ -78,7 +81,7 @@ class Lighting:
         ratios = plan_bracket(target.exposures, target.shown).ratios
         make_plan(Request(scene, target.quality, target.size, target.outputs, ratios))
         self.builder = ThreadPoolExecutor(1, "warp-ar-build")
-        """Builds pipelines and does other work beside the frames."""
+        """Executor that builds pipelines and does other work in the background."""
         self._main = PipelineSwitcher(builder=self.builder, device=device, estimates="real_time")
         self._second = PipelineSwitcher(builder=self.builder, device=device, estimates="real_time")
         self._good = controls.wanted
@@ -91,11 +94,11 @@ class Lighting:
         self._bracket_notes: tuple[str, ...] = ()
         self._progress: tuple[str, int, int] | None = None
         self.plan: Plan | None = None
-        """Plan by which the frames are lit."""
+        """Plan of the pipeline that lights the frames."""
 
     @property
     def swaps(self) -> int:
-        """Number of the plan: grows whenever stages or quality change."""
+        """Number of the plan, which grows with every change of pipeline."""
         return self._main.swaps
 
     @property
@@ -105,26 +108,26 @@ class Lighting:
 
     @property
     def changing(self) -> bool:
-        """True while the frames are about to be lit by another pipeline."""
+        """True while a new pipeline for the frames is requested or being built."""
         followed = self._followed
         return not self._settled or followed is None or followed[0] is not self._controls.wanted
 
     @property
     def compare_ready(self) -> bool:
-        """True if the picture to compare with is there."""
+        """True if the pipeline of the picture to compare with is ready, or none is needed."""
         return self._controls.compare in ("", CAMERA) or self._second.pipeline is not None
 
     def doing(self) -> dict[str, Any] | None:
-        """Return the pipeline that is being built, for a line on the page; None while none is."""
+        """Return the quality being built and its count of loaded kernels, for the page; None while none is built."""
         if not self.busy:
             return None
-        then = self._then  # once: the thread of the frames sets it
+        then = self._then  # read once, as the thread of the frames sets it
         target = then if then is not None and not self.changing else self._first or self._now
         name, done, count = self._progress or (target.quality.name, 0, 0)
         return {"quality": name, "done": done, "count": count}
 
     def _aim(self, wanted: Wanted, compare: str, feed: Feed) -> None:
-        """Note what is to be built from now on."""
+        """Set the targets that are built from now on."""
         self._followed, self._settled = (wanted, compare, feed), False
         now = self._now = make_target(wanted, feed)
         self._then = dataclasses.replace(now, quality=PRESETS[compare]) if compare in PRESETS else None
@@ -132,9 +135,9 @@ class Lighting:
         self._first = dataclasses.replace(now, quality=FIRST) if elsewhere else None
 
     def follow(self) -> Pipeline | None:
-        """Return the pipeline for the next frame; None where none is built that shows this scene.
+        """Return the pipeline for the next frame; None until one for the present scene and size is built.
 
-        An edit that cannot be built is undone and told.
+        An edit whose pipeline cannot be built is undone, and viewers are notified.
         """
         controls = self._controls
         with controls.changed:
@@ -147,7 +150,7 @@ class Lighting:
             self._follow_main()
         except Exception as error:
             if self._first is not None and isinstance(error, WarpArError):
-                self._first = None  # what is wanted itself may do
+                self._first = None  # the wanted quality itself may still work
             else:
                 self._first, self._settled = None, True
                 self._notify(failure(error, "what was shown before stays"))
@@ -168,22 +171,22 @@ class Lighting:
         return self._main.pipeline if self._place == _place(self._now) else None
 
     def _tell_bracket(self, notes: tuple[str, ...]) -> None:
-        """Say what of the source's exposures is not merged, once."""
+        """Notify viewers, once, of exposures of the source that are not merged."""
         if notes != self._bracket_notes:
             self._bracket_notes = notes
             for note in notes:
                 self._notify(notice(note))
 
     def note_lit(self) -> None:
-        """Note that a frame was lit: what it shows is good, and is gone back to where a later edit fails."""
+        """Record the present state as good after a lit frame, to return to it if a later edit fails."""
         if self._settled and self._followed is not None:
             self._good = self._followed[0]
 
     def take_back(self) -> bool:
-        """Want again what was good, after a failure of what is followed now.
+        """Restore the last good state after a failure of the present state.
 
         Returns:
-            True if something else was wanted; False if what was good has failed itself.
+            True if the state was restored; False if the failed state is the last good one.
         """
         if self._followed is None or self._followed[0] is self._good:
             return False
@@ -202,7 +205,7 @@ class Lighting:
                 self._settled = True
 
     def _warm_up(self, pipeline: Pipeline) -> None:
-        """Load the kernels of a new pipeline; viewers are told how far that is."""
+        """Load the kernels of a new pipeline and record the progress for viewers."""
         name = pipeline.quality.name
 
         def tell(done: int, count: int) -> None:
@@ -215,7 +218,7 @@ class Lighting:
             self._progress = None
 
     def other(self, frame: Frame, now: float) -> Image | None:
-        """Return the picture to compare with; None without a comparison, or until it is built."""
+        """Return the picture to compare with; None without a comparison, or until its pipeline is built."""
         if self._controls.compare == CAMERA:
             return frame.image
         pipeline = self._second.pipeline
@@ -227,7 +230,7 @@ class Lighting:
         return None
 
     def plan_message(self) -> dict[str, Any]:
-        """Return the message of the stages that run, and of those left out with the reason."""
+        """Return the message of the running stages, and of the omitted stages with the reason for each."""
         told = {"type": "plan", "plan": self.swaps, "device": self.device, "quality": None, "run": [], "left_out": []}
         if self.plan is None:
             return told
@@ -243,40 +246,47 @@ class Lighting:
         return {**told, "quality": quality.name, "run": run, "left_out": out}
 
     def close(self, wait_seconds: float | None = None) -> bool:
-        """Let the pipelines go; wait so long at most for what is being built, and return True if that has ended."""
+        """Close the pipelines.
+
+        Args:
+            wait_seconds: Longest wait for pipelines that are being built; None sets no limit.
+
+        Returns:
+            True if all building has ended.
+        """
         self._main.close(wait=False)
         self._second.close(wait=False)
         done = threading.Event()
-        self.builder.submit(done.set)  # after all that was submitted before
+        self.builder.submit(done.set)  # runs after all tasks submitted before
         ended = done.wait(wait_seconds)
         self.builder.shutdown(wait=ended, cancel_futures=not ended)
         return ended
 
 
 def _place(target: Target) -> Any:
-    """Return the place of a picture, whatever its quality: a pipeline of another one would show nonsense."""
+    """Return a key of scene, marker and frame size. Pipelines of another key cannot show the present frames."""
     scene = target.scene
     return scene.name, scene.path, scene.marker, target.size
 
 
 FULL_SCALE: Final = 0.2
-"""Difference, relative to full scale, that has the last colour."""
+"""Difference that gets the last colour of the scale, as a fraction of the largest code."""
 SLICE_SECONDS: Final = 0.04
-"""Seconds of sampling between two looks at viewers' requests."""
+"""Length of one slice of sampling, between which viewers' requests are handled, seconds."""
 SHOWN_SECONDS: Final = 0.3
-"""Least seconds between two pictures."""
+"""Shortest time between two pictures of the reference, seconds."""
 LIGHT_SAMPLES: Final = 8
-"""Per pixel, by which the reflectance of proxies is found; fewer than offline, for somebody waits."""
+"""Samples per pixel that estimate the reflectance of proxies; fewer than offline, to start sooner."""
 LEAST_SAMPLES: Final = 16
-"""Per pixel, before which an error is not believed."""
+"""Smallest number of samples per pixel at which the estimated error is used."""
 GOAL: Final = 0.002
-"""Relative standard error at which a picture rests."""
+"""Relative standard error at which sampling ends."""
 MOST_SAMPLES: Final = 4096
-"""Per pixel, after which it does, too."""
+"""Number of samples per pixel at which sampling ends."""
 
 
 def false_colors(image: Image, reference: Image) -> Image:
-    """The largest channel's difference as a colour, black at none and light yellow from FULL_SCALE on."""
+    """Return the largest difference of the channels in false colours: black at 0, light yellow from FULL_SCALE on."""
     off = np.abs(image.astype(np.int16) - reference.astype(np.int16)).max(axis=2)
     share = np.clip(off / (255.0 * FULL_SCALE), 0.0, 1.0)
     colors = cv2.applyColorMap(np.round(255.0 * share).astype(np.uint8), cv2.COLORMAP_INFERNO)
@@ -291,7 +301,10 @@ def _is_done(picture: TracedPicture) -> bool:
 
 
 class Convergence:
-    """Follows paths of one held frame. The thread of the frames calls it; ``status`` may be read by any."""
+    """Progressive path tracing of one held frame.
+
+    Methods are called by the thread of the frames; ``status`` may be read by any thread.
+    """
 
     def __init__(self) -> None:
         self._key: Any = None
@@ -300,7 +313,7 @@ class Convergence:
         self._lit: Image | None = None
         self._shown = 0.0
         self.status: dict[str, float] | None = None
-        """Record for viewers; None while there is no picture."""
+        """Samples, errors and difference, for viewers; None while there is no picture."""
 
     def begin(
         self,
@@ -311,15 +324,15 @@ class Convergence:
         seconds: float,
         builder: ThreadPoolExecutor,
     ) -> None:
-        """Trace a frame that was just lit, unless it is the one in hand.
+        """Start to trace a frame that was just lit, unless it is being traced already.
 
         Args:
-            key: Identity of the picture; another one begins anew.
-            pipeline: That lit it.
-            frame: As the camera gave it.
-            result: The pipeline's result of it.
-            seconds: On the pipeline's clock: where what is animated stands.
-            builder: Compiles, uploads and takes the first sample beside the frames.
+            key: Key of the picture; a new key starts a new reference.
+            pipeline: Pipeline that lit the frame.
+            frame: Picture of the camera.
+            result: The pipeline's result for the frame.
+            seconds: Time of the frame on the pipeline's clock, which sets the pose of animations.
+            builder: Executor that compiles, uploads and takes the first sample in the background.
         """
         if key == self._key:
             return
@@ -330,7 +343,7 @@ class Convergence:
 
         def make() -> PathTracer:
             tracer = known.tracer(device=str(pipeline.device), light_samples=LIGHT_SAMPLES)
-            # All kernels are compiled here, so that no slice waits for that; what is dropped meanwhile ends.
+            # All kernels are compiled here, so that no slice waits for compilation. A dropped picture ends the loop.
             while self._key is key and not tracer.sample_for(SLICE_SECONDS):
                 pass
             if tracer.samples > 0:
@@ -340,13 +353,13 @@ class Convergence:
         self._made = builder.submit(make)
 
     def drop(self) -> None:
-        """Forget the picture: something moves on."""
+        """Drop the reference, as the picture that it belongs to is no longer shown."""
         if self._made is not None:
             self._made.cancel()
         self._key = self._made = self._picture = self._lit = self.status = None
 
     def progress(self, key: Any) -> str:
-        """Return "running" or "done" for the picture of ``key``; empty where there is none."""
+        """Return "running" or "done" for the reference of ``key``; empty if there is none."""
         if key != self._key or (self._made is None and self._picture is None):
             return ""
         if self._picture is not None and _is_done(self._picture):
@@ -357,7 +370,7 @@ class Convergence:
         """Add a slice of samples; return True if there is a new picture to show.
 
         Raises:
-            Exception: The frame cannot be traced, such as on a device whose memory is full; it is not tried again.
+            Exception: The frame cannot be traced, for example without free device memory; it is not tried again.
         """
         made = self._made
         if made is None or not made.done():
@@ -379,14 +392,14 @@ class Convergence:
         return True
 
     def other(self, key: Any, compare: str) -> Image | None:
-        """Return the picture to compare with; None until there is one."""
+        """Return the reference, or the difference to it in false colours; None until the first samples are done."""
         picture, lit = self._picture, self._lit
         if key != self._key or picture is None or lit is None:
             return None
         return picture.image if compare == TRACED else false_colors(lit, picture.image)
 
     def _told(self, picture: TracedPicture, lit: Image) -> dict[str, float]:
-        """Samples, relative standard error and mean difference of the picture; all but the first in per cent."""
+        """Return the status for viewers: samples per pixel, and errors and differences in per cent."""
         off = float(cv2.norm(lit, picture.image, cv2.NORM_L1)) / lit.size
         return {
             "samples": picture.samples,

@@ -1,11 +1,11 @@
 """Messages between the page and the server, with notices and failures for viewers.
 
-From the page come text messages, JSON objects with a ``type``, and binary messages, pictures of the browser's camera.
-Nothing that comes in is trusted: a message that is not exactly one of ``_MESSAGES`` raises ``ProtocolError``, whose
-text is the reason with which its sender is dropped.
+The page sends text messages (JSON objects with a ``type``) and binary messages (pictures of the browser's camera).
+Messages are not trusted: any that does not match an entry of ``_MESSAGES`` raises ``ProtocolError``. The server then
+closes the connection, with the error's text as the reason.
 
-From the server come text messages, and binary ones: four bytes, the length of a JSON header (little endian), the
-header, then the pictures that it names, one after another.
+The server sends text messages and binary messages. A binary message holds four bytes with the length of a JSON header
+(little endian), the header, and the pictures that it lists, one after another.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from warp_ar.errors import WarpArError, reason
 from warp_ar.pictures import picture_size
 
 SCHEMA: Final = 3
-"""Version of the messages, told in ``hello``; it grows when keys change."""
+"""Version of the messages, sent in ``hello``; it grows when keys change."""
 MAX_TEXT: Final = 4096
 """Longest text message from a page in bytes: an edit takes under 200."""
 MAX_PICTURE: Final = 1 << 20
-"""Largest binary message from a page in bytes: a JPEG of 1920x1080 at quality 0.85 takes half of that."""
+"""Largest binary message from a page in bytes: a JPEG of 1920x1080 at quality 0.85 takes half of it."""
 MOST_BYTES: Final = 1 << 26
 """Largest dropped file, bytes: 64 MB."""
 SMALLEST_CAMERA: Final = (64, 48)
@@ -49,24 +49,24 @@ KINDS: Final = {
 }
 """Kinds of each part that the page can add. Meshes are files, and the page names no file."""
 OUTLINES: Final = ("plane", "wall", "box")
-"""Shapes of the desk that can be pointed out by four points of the picture."""
+"""Kinds of proxies that can be outlined by four points of the picture."""
 SETUP_STEPS: Final = ("check", "ball", "light", "response")
-"""Steps of a set-up: ``check`` all of it, measure the ``ball`` or the camera's ``response``, or take
-the ``light`` from the card."""
+"""Steps of the set-up: ``check`` everything, measure the ``ball`` or the camera's ``response``, or estimate the
+``light`` from the printed card."""
 
 
 class ProtocolError(WarpArError, ValueError):
-    """Message that the page never sends."""
+    """Error of a message that a page never sends."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Text message of a page, checked."""
+    """Checked text message of a page."""
 
     type: str
     """One of ``_MESSAGES``."""
     fields: Mapping[str, Any]
-    """Its other keys."""
+    """Other keys of the message."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,12 +75,12 @@ class Picture:
 
     id: int
     taken: float
-    """Milliseconds on the browser's own clock."""
+    """Time of capture, milliseconds on the browser's own clock."""
     jpeg: bytes
 
 
 Check = Callable[[Any], Any]
-"""Function that converts a value of a message, or raises a ProtocolError."""
+"""Function that checks and converts a value of a message, or raises a ProtocolError."""
 
 
 def _expect(fits: bool, words: str) -> None:
@@ -148,49 +148,49 @@ _NAME = {"name": _name}
 _ON = {"on": _flag}
 
 _MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
-    # The frame of this number is on the screen.
+    # Acknowledges that the frame of this number is on the screen.
     "ack": {"id": _integer(0, 1 << 53)},
-    # Asks for the server's clock; ``sent`` comes back.
+    # Requests the server's clock; the answer repeats ``sent``.
     "ping": {"sent": _number(0.0, 1e15)},
-    # Asks for the object that is seen at a pixel, or nearest to it within a reach, pixels; all comes back.
+    # Requests the object at a pixel, or nearest to it within ``reach`` pixels; the answer repeats the arguments.
     "pick": {"x": _number(-1e5, 1e5), "y": _number(-1e5, 1e5), "reach": _number(0.0, 64.0)},
-    # Gives a key of a scene's part a value, as the scene file would.
+    # Sets a key of a part of the scene, as in a scene file.
     "set": {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value},
-    # Changes how an object plays an animation of its file; a flag is 0 or 1.
+    # Changes the playback of an object's animation; a flag is 0 or 1.
     "animate": {"index": _INDEX, "key": _choice(*ANIMATED), "value": _number(-1.0, 1e3)},
     "add": {"part": _choice(*KINDS), "kind": _name},
-    # Adds another object, light or proxy that is as one of the scene's, beside it.
+    # Adds a copy of an object, light or proxy near the original.
     "duplicate": {"part": _choice(*KINDS), "index": _INDEX},
-    # Puts an object's lowest point on the desk.
+    # Moves an object vertically until its lowest point is on the desk.
     "snap": {"index": _INDEX},
     "remove": {"part": _choice(*KINDS), "index": _INDEX},
     "show": {"part": _choice(*KINDS), "index": _INDEX, **_ON},
     "effect": {"name": _choice(*EFFECTS), **_ON},
     "quality": _NAME,
-    # Chooses the method of one stage; an empty name goes back to the preset's.
+    # Chooses the method of one stage; an empty name restores the preset's method.
     "method": {"stage": _name, "method": _name},
-    # Milliseconds per frame that the preset may cost; null leaves the preset alone.
+    # Sets the budget, milliseconds per frame; null returns to a preset.
     "budget": {"ms": _optional(_number(1.0, 10000.0))},
-    # Shows something beside the picture: nothing, the camera's frame, a preset, the reference.
+    # Chooses the picture to compare with: none, the camera's frame, a preset, or the reference.
     "compare": {"other": _name},
-    # Lets frames flow, or holds the one in hand.
+    # Plays frames, or holds the present one.
     "play": _ON,
     "scene": _NAME,
-    # Models a part of the desk that four points of the picture outline, in pixels.
+    # Adds a proxy for the part of the desk that four points of the picture outline, pixels.
     "outline": {"kind": _choice(*OUTLINES), "points": _points},
-    # Makes the printed card the marker: the ball's radius and what its rulers of 100 mm measure, metres.
+    # Makes the printed card the marker. Both are in metres: radius of the ball, measured length of the 100 mm rulers.
     "card": {"radius": _number(0.0, 10.0), "ruler": _number(0.0, 10.0)},
     "setup": {"step": _choice(*SETUP_STEPS)},
     "undo": {},
     "redo": {},
     "reset": {},
-    # Makes the page's camera the source; its pictures follow.
+    # Makes the camera of the page's browser the source; binary messages with its pictures follow.
     "camera": {
         "width": _integer(SMALLEST_CAMERA[0], LARGEST_CAMERA[0]),
         "height": _integer(SMALLEST_CAMERA[1], LARGEST_CAMERA[0]),
     },
     "no_camera": {},
-    # Looks out for the printed board, leaves it at that, or uses what was seen.
+    # Starts to collect views of the printed board, stops without a result, or computes the camera from the views.
     "calibrate": {"step": _choice("start", "stop", "finish")},
 }
 
@@ -203,7 +203,7 @@ def parse_text(text: str) -> Command:
     """Return the command of a text message.
 
     Raises:
-        ProtocolError: It is none.
+        ProtocolError: The message is not a valid command.
     """
     if len(text) > MAX_TEXT:
         raise ProtocolError(f"text message of {len(text)} characters; {MAX_TEXT} at most")
@@ -237,7 +237,7 @@ def parse_picture(data: bytes, size: tuple[int, int]) -> Picture:
     """Return the picture of a binary message: time (float64), number (uint32), then a JPEG of ``size``.
 
     Raises:
-        ProtocolError: It is none.
+        ProtocolError: The message is not such a picture.
     """
     if len(data) > MAX_PICTURE:
         raise ProtocolError(f"picture of {len(data)} bytes; {MAX_PICTURE} at most")
@@ -254,19 +254,19 @@ def parse_picture(data: bytes, size: tuple[int, int]) -> Picture:
 
 
 def pack(header: Mapping[str, Any], *pictures: bytes) -> bytes:
-    """Return a binary message of the server; ``sizes`` in its header are those of the pictures."""
+    """Return a binary message of the server; ``sizes`` in its header lists the pictures' lengths in bytes."""
     text = json.dumps({**header, "sizes": [len(picture) for picture in pictures]}, separators=(",", ":")).encode()
     return b"".join((struct.pack("<I", len(text)), text, *pictures))
 
 
 class Bucket:
-    """Bound on a rate: holds ``burst`` tokens, ``rate`` more per second come back."""
+    """Token bucket that limits a rate: it holds up to ``burst`` tokens and gains ``rate`` tokens per second."""
 
     def __init__(self, rate: float, burst: float) -> None:
         self._rate, self._burst, self._left, self._last = rate, burst, burst, 0.0
 
     def take(self, amount: float, now: float) -> bool:
-        """Return True if ``amount`` may pass at ``now`` (seconds), and take it."""
+        """Take ``amount`` tokens at the time ``now``, seconds; return False if there are too few."""
         self._left = min(self._burst, self._left + max(now - self._last, 0.0) * self._rate)
         self._last = now
         if self._left < amount:
@@ -279,9 +279,9 @@ Notify = Callable[[dict[str, Any]], None]
 """Receiver of a message for all viewers, called on any thread."""
 
 _LONGEST: Final = 400
-"""Characters of a notice about a fault: an exception's text may be a whole file."""
+"""Largest number of characters of an exception's text in a notice; such a text may hold a whole file."""
 _FOLDERS: Final = re.compile(r"(?<![\w:/.])(?:[A-Za-z]:\\|/)(?:[^\s/\\:;,'\"()]+[/\\])+")
-"""Folders of an absolute path: those of this machine are not for viewers; the file's name stays."""
+"""Pattern of the folders in an absolute path, which are removed from notices; file names stay."""
 
 
 def notice(text: str, *, bad: bool = False) -> dict[str, Any]:
@@ -290,29 +290,29 @@ def notice(text: str, *, bad: bool = False) -> dict[str, Any]:
 
 
 def failure(error: BaseException, then: str = "the frames go on") -> dict[str, Any]:
-    """Return the notice for an exception; every exception of a frame or of work beside the frames comes here.
+    """Return the notice for an exception in a frame or in background work.
 
-    An error of the program's own says what is wrong as it stands. Any other is a fault of the program: its traceback
-    goes to the terminal, and viewers are told its type, its text and what happens next.
+    A ``WarpArError`` has a message for users, which becomes the notice. Any other exception is a fault of the program:
+    its traceback is printed on the terminal, and the notice holds its type, its text and ``then``.
 
     Args:
         error: The exception.
-        then: Words for the next step, where the error is a fault.
+        then: Words on how the program continues after a fault.
     """
     if isinstance(error, WarpArError):
         return notice(_FOLDERS.sub("", str(error)), bad=True)
-    with contextlib.suppress(OSError, ValueError):  # nobody may read it any more
+    with contextlib.suppress(OSError, ValueError):  # the terminal may have been closed
         traceback.print_exception(error, file=sys.stderr)
     words = _FOLDERS.sub("", reason(error)[:_LONGEST])
     return notice(f"this failed: {type(error).__name__}: {words}; {then}", bad=True)
 
 
 def begin(helper: Executor, notify: Notify, work: Callable[..., None], *arguments: Any) -> Future[None]:
-    """Run work beside the frames; an error that it does not catch itself becomes a notice.
+    """Start a function in the background; an exception that it raises becomes a notice.
 
     Args:
-        helper: Executor that runs it.
-        notify: Receiver of the notice, called on the helper's thread.
+        helper: Executor that runs the function.
+        notify: Receiver of the notice, called on the executor's thread.
         work: Function to run.
         *arguments: Arguments of ``work``.
     """

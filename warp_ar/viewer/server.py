@@ -1,17 +1,17 @@
 """Server of the page, over HTTP and one WebSocket per viewer.
 
-A viewer is sent a frame only after it has shown an earlier one: two are under way at most, and the newest wins.
-Pictures are encoded once for all viewers, and only if one is ready for them. Nothing that a viewer sends is trusted;
-one that breaks the rules is dropped with a reason, and no other notices. Other programs ask for the light:
+At most two frames are under way to a viewer: the next is sent after the viewer has shown one, and always the newest.
+Pictures are encoded once for all viewers, and only if a viewer is ready for one. Messages are not trusted: a viewer
+that breaks the protocol is disconnected with a reason, without effect on others. Other programs can request the light:
 
     GET /light.json                 harmonics, key light, interval, exposure, pose
     GET /light.exr, /light.hdr      the environment: ``?axes=``, ``?layout=cube``, ``?size=``, ``?ball=``
     GET /light/px.hdr ... nz.hdr    one face of the cube
     WS  /light                      the same JSON, when it has changed; text, no answer expected
 
-All take ``?axes=`` (z-up, blender, opengl, and the default, y-up) and the token as the page does. Who asks counts as a
-viewer for some seconds, so that frames are lit though nobody looks at the page. ``light_record``, which makes the
-answers, loads Warp, for which the page does not wait.
+All take ``?axes=`` (z-up, blender, opengl, and the default, y-up) and the page's token. Each request counts as a viewer
+for some seconds, so that frames are lit even if no page is open. ``light_record``, which makes the answers, is imported
+late: it loads Warp, for which the page should not wait.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from warp_ar.viewer.protocol import MOST_BYTES, failure
 if TYPE_CHECKING:
     from warp_ar.scene import Pose
     from warp_ar.viewer.host import (
-        Host,  # loads Warp, for which the page does not wait
+        Host,  # imported late elsewhere: it loads Warp, for which the page should not wait
         Lit,
     )
     from warp_ar.viewer.light_record import LightState
@@ -59,23 +59,23 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 JPEG_QUALITY: Final = 85
-"""Quality of JPEG: a desk at 640x480 has 60 KB, at quality 95 twice that."""
+"""JPEG quality: a frame of ``desk`` at 640x480 takes 60 KB, at quality 95 twice as much."""
 IN_FLIGHT: Final = 2
-"""Frames that a viewer may have unshown: one on the way while another is decoded."""
+"""Frames sent to a viewer that it has not shown yet: one under way while another is decoded."""
 SEND_SECONDS: Final = 20.0
-"""Time after which a viewer that takes nothing is dropped."""
+"""Time after which a viewer that receives nothing is disconnected, seconds."""
 STATE_SECONDS: Final = 0.5
 STOP_SECONDS: Final = 0.7
-"""Longest wait at the end for a frame in hand, and as long for pipelines that are being built."""
+"""Longest wait at the end for the present frame, and again for pipelines that are being built, seconds."""
 MOST_VIEWERS: Final = 8
 MESSAGES_PER_SECOND: Final = 240.0
 BYTES_PER_SECOND: Final = 8e6
-"""Thirty pictures a second of a camera at 1920x1080."""
+"""Data rate of a viewer, bytes / s: 30 pictures per second of a camera at 1920x1080."""
 
 DROP_SECONDS: Final = 60.0
-"""Longest time for a dropped file to come."""
+"""Longest time to receive a dropped file, seconds."""
 DROPS: Final = 4
-"""Files that may be on their way at once: a slow one does not hold up the others."""
+"""Files that may be received at once, so that a slow one does not delay the others."""
 _TYPES: Final = {
     "html": "text/html; charset=utf-8",
     "css": "text/css; charset=utf-8",
@@ -88,9 +88,9 @@ _TYPES: Final = {
 
 
 WATCH_SECONDS: Final = 5.0
-"""Time that a request keeps frames going."""
+"""Time for which a request for the light keeps frames going, seconds."""
 PUSH_SECONDS: Final = 0.1
-"""Time between two looks of the channel for changes; the light itself is looked at four times a second."""
+"""Time between two checks for changes of pose and light, seconds; the light changes at most four times a second."""
 MOST_LISTENERS: Final = 8
 LARGEST_FACE: Final = 1024
 
@@ -99,7 +99,7 @@ _POLICY: Final = (
     "media-src 'self' blob:; connect-src 'self' ws: wss:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _RUN: Final = secrets.token_hex(4)
-"""Name of this run: a page that comes back to another one has lost its edits."""
+"""Identifier of this run. A page that reconnects to another run has lost its edits."""
 HEADERS: Final = {
     "Content-Security-Policy": _POLICY,
     "X-Content-Type-Options": "nosniff",
@@ -107,7 +107,7 @@ HEADERS: Final = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Headers of every answer, refusals too."""
+"""Headers of every answer, refusals included."""
 
 
 def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
@@ -118,7 +118,7 @@ def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
 
 @functools.lru_cache(maxsize=2)
 def pack_light(light: LightState | None) -> bytes:
-    """Return the message of an environment, a PNG: x / (1 + x), which shows clipped light too, encoded as sRGB."""
+    """Return the message of an environment as a PNG of x / (1 + x), which shows clipped light too, in sRGB codes."""
     if light is None:
         return protocol.pack({"type": "light", "known": False}, b"")
     value = np.maximum(light.radiance, 0.0)
@@ -149,7 +149,7 @@ def pack_frame(lit: Lit) -> bytes:
 
 
 class _Viewer:
-    """One WebSocket."""
+    """Connection to one viewer over a WebSocket, with the queue of its messages."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
         self.socket = socket
@@ -163,7 +163,7 @@ class _Viewer:
         self.picture: asyncio.Task[None] | None = None
 
     def tell(self, message: str | bytes | dict[str, Any]) -> None:
-        """Send a message when there is room for it; a viewer that lets 64 pile up misses some."""
+        """Queue a message; drop it if 64 messages wait already."""
         with contextlib.suppress(asyncio.QueueFull):
             self.queue.put_nowait(json.dumps(message) if isinstance(message, dict) else message)
         self.wake.set()
@@ -172,7 +172,7 @@ class _Viewer:
         """Send a message now.
 
         Raises:
-            TimeoutError: The viewer takes nothing.
+            TimeoutError: The viewer receives nothing.
         """
         send = self.socket.send_str if isinstance(message, str) else self.socket.send_bytes
         await asyncio.wait_for(send(message), SEND_SECONDS)  # type: ignore[arg-type]
@@ -184,7 +184,7 @@ class _Viewer:
 
 
 class Server:
-    """The page of one host, which is made beside the loop, and the threads that work for its requests."""
+    """Server of one host's page. The host is made in a thread, and other threads do the work of requests."""
 
     def __init__(
         self, make_host: Callable[..., Host], address: Address, *, header_seconds: float = HEADER_SECONDS
@@ -192,12 +192,12 @@ class Server:
         """Build the application.
 
         Args:
-            make_host: Called with ``publish`` and ``notify`` once the page is served; gives the host.
+            make_host: Function that returns the host, called with ``publish`` and ``notify`` once the page is served.
             address: Address to serve at.
-            header_seconds: Longest time for a request's header.
+            header_seconds: Longest time for a request's header, seconds.
         """
         self.address = address
-        """Address of the page; with the port that was taken, once it is served."""
+        """Address of the page, with the actual port once it is served."""
         self._make_host = make_host
         self._host: Host | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -208,11 +208,11 @@ class Server:
         self._viewers: set[_Viewer] = set()
         self._latest: Lit | None = None
         self.ended = True
-        """False if ``serve`` left a thread of the frames behind that took too long to end."""
+        """False if ``serve`` returned while a thread of the frames was still running."""
         self.gate = Gate(HEADERS, header_seconds=header_seconds)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
         self.app.on_response_prepare.append(self._add_headers)
-        # Read once: no request's path ever becomes a file's.
+        # Read once, so that no request's path is ever used as a file path.
         folder = importlib.resources.files("warp_ar.viewer") / "static"
         self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
         self._coming = self._listeners = 0
@@ -237,10 +237,10 @@ class Server:
     async def _guard(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        """Refuse requests from other sites, and beyond this machine those without the token."""
+        """Refuse requests from other sites and, if a token is set, requests without the token."""
         name = (request.host if request.host.endswith("]") else request.host.rsplit(":", 1)[0]).strip("[]")
         token, public = self.address.token, request.path.startswith("/static/")
-        # A foreign site that has its name resolve to this machine would pass every other check.
+        # A site whose name resolves to this machine (DNS rebinding) would pass every other check.
         if self.address.loopback and token is None and name not in LOOPBACK:
             return self._refuse(request, f"this page is at {self.address.url}")
         origin = request.headers.get("Origin")
@@ -256,11 +256,11 @@ class Server:
             return await handler(request)
 
     def _is_welcome(self, request: web.Request) -> bool:
-        """Return True for a request for the light from a site that may have it."""
+        """Return True for a request for the light from an allowed origin."""
         return request.headers.get("Origin") in self.address.origins and request.path.startswith("/light")
 
     def _refuse(self, request: web.Request, reason: str) -> web.Response:
-        """Return a refusal: a page for who opens one, else a line."""
+        """Return a refusal: a page if the request accepts HTML, else one line of text."""
         response = web.Response(status=403, text=f"warp_ar: {reason}\n")
         if "text/html" in request.headers.get("Accept", ""):
             page = self._static["refused.html"].decode()
@@ -279,7 +279,7 @@ class Server:
     # ------------------------------------------------------------------------------------------------ the host, threads
 
     async def started(self) -> Host:
-        """Return the host, once it is there."""
+        """Wait until the host is made, and return it."""
         while self._host is None:
             await asyncio.sleep(0.05)
         return self._host
@@ -287,10 +287,10 @@ class Server:
     def aside(
         self, function: Callable[..., _T], *arguments: Any, pool: ThreadPoolExecutor | None = None
     ) -> asyncio.Future[_T]:
-        """Begin work that may take long beside the loop.
+        """Run a function that may take long in a thread of ``pool``, by default of ``_hands``.
 
         Raises:
-            asyncio.CancelledError: The server is ending, and its threads take nothing more.
+            asyncio.CancelledError: The server is ending.
         """
         if self._ending:
             raise asyncio.CancelledError
@@ -298,16 +298,16 @@ class Server:
         return loop.run_in_executor(pool or self._hands, functools.partial(function, *arguments))
 
     async def websocket(self, request: web.Request, largest: int) -> web.WebSocketResponse:
-        """Make a WebSocket of a request, whose messages have so many bytes at most."""
+        """Upgrade a request to a WebSocket whose incoming messages have at most ``largest`` bytes."""
         socket = web.WebSocketResponse(max_msg_size=largest, heartbeat=30.0, compress=False)
         await socket.prepare(request)
-        self.gate.connection_of(request).deadline = float("inf")  # its heartbeat looks after it
+        self.gate.connection_of(request).deadline = float("inf")  # dead WebSockets are found by their heartbeat
         return socket
 
     # ---------------------------------------------------------------------------------------------------------- frames
 
     def _publish(self, lit: Lit) -> None:
-        """Take a frame, on the host's thread."""
+        """Pass a new frame to the event loop; called on the host's thread."""
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self._arrived, lit)
 
@@ -317,7 +317,7 @@ class Server:
             viewer.wake.set()
 
     def _notify(self, message: dict[str, Any]) -> None:
-        """Take a message for all, on any thread."""
+        """Pass a message for all viewers to the event loop; called on any thread."""
         if self._loop is not None:
             self._loop.call_soon_threadsafe(self._tell_all, json.dumps(message))
 
@@ -326,7 +326,7 @@ class Server:
             viewer.tell(message)
 
     async def _send(self, viewer: _Viewer) -> None:
-        """Send a viewer messages and the newest frame, as fast as it takes them."""
+        """Send a viewer its queued messages and the newest frame, as fast as it receives them."""
         try:
             while True:
                 await viewer.wake.wait()
@@ -339,13 +339,13 @@ class Server:
                 viewer.sent = lit.id
                 viewer.unshown.add(lit.id)
                 await viewer.send(await self.aside(pack_frame, lit, pool=self._encoder))
-                # A newer one may have come meanwhile.
+                # A newer frame may have arrived meanwhile.
                 viewer.wake.set()
         except (TimeoutError, ConnectionError):
             await viewer.drop(WSCloseCode.POLICY_VIOLATION, "nothing was taken for too long")
 
     async def _tick(self, host: Host) -> None:
-        """Tell viewers what changes by itself."""
+        """Send viewers the state message twice a second, and the environment when it has changed."""
         shown: LightState | None = None
         while True:
             await asyncio.sleep(STATE_SECONDS)
@@ -363,11 +363,11 @@ class Server:
             return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n")
         host = await self.started()
         viewer = _Viewer(await self.websocket(request, protocol.MAX_PICTURE + 64))
-        self._viewers.add(viewer)  # from here on news wait in its queue, to be sent after its greetings
+        self._viewers.add(viewer)  # from here on messages wait in its queue, to be sent after the greetings
         host.watch(1)
         sender: asyncio.Task[None] | None = None
         try:
-            # Not on the loop: to tell how large a mesh is, its file is read.
+            # In a thread: the greetings contain the sizes of meshes, whose files must be read.
             for message in (self._hello(), *await self.aside(host.greetings)):
                 await viewer.send(json.dumps(message))
             await viewer.send(await self.aside(pack_light, host.light_state, pool=self._encoder))
@@ -381,7 +381,7 @@ class Server:
             for task in (sender, viewer.picture):
                 if task is not None:
                     task.cancel()
-            if not self._ending:  # else the host gives up its camera by itself
+            if not self._ending:  # at the end the host closes all cameras itself
                 await self.aside(host.leave_camera, viewer)
         return viewer.socket
 
@@ -398,7 +398,7 @@ class Server:
         }
 
     async def _receive(self, host: Host, viewer: _Viewer) -> None:
-        """Take a viewer's messages until it leaves or breaks a rule."""
+        """Handle a viewer's messages until it leaves or breaks the protocol."""
         async for message in viewer.socket:
             now = time.monotonic()
             size = len(message.data) if message.type in (WSMsgType.TEXT, WSMsgType.BINARY) else 0
@@ -410,7 +410,7 @@ class Server:
                     await self._command(host, viewer, protocol.parse_text(message.data))
                 elif message.type is WSMsgType.BINARY:
                     self._camera_picture(host, viewer, message.data)
-                else:  # aiohttp has closed it already, with the reason that the protocol has for it
+                else:  # aiohttp has already closed the connection, with the standard's reason
                     return
             except protocol.ProtocolError as error:
                 await viewer.drop(WSCloseCode.POLICY_VIOLATION, str(error))
@@ -435,9 +435,9 @@ class Server:
     def _camera_picture(self, host: Host, viewer: _Viewer, data: bytes) -> None:
         size = host.camera_size(viewer)
         if size is None:
-            return  # a picture that was on the way when the camera was switched off
+            return  # the picture was under way when the camera was switched off
         picture = protocol.parse_picture(data, size)
-        # The page waits for "taken"; a viewer that does not has pictures left out.
+        # The page waits for "taken" before its next picture. Pictures of a viewer that does not wait are skipped.
         if viewer.picture is None or viewer.picture.done():
             viewer.picture = asyncio.create_task(self._push(host, picture, viewer))
 
@@ -458,7 +458,7 @@ class Server:
         return _answer(self._static[name], name)
 
     async def _code(self, request: web.Request) -> web.Response:
-        """Return the page's address for other machines as a picture that phones read."""
+        """Return the page's address for other machines as a QR code."""
         buffer = io.BytesIO()
         segno.make_qr(self.address.outside_url or self.address.url).save(buffer, "svg", scale=5, border=3, light="#fff")
         return _answer(buffer.getvalue(), "code.svg")
@@ -477,13 +477,13 @@ class Server:
         return web.Response(body=body, headers=headers)
 
     async def _drop(self, request: web.Request) -> web.Response:
-        """Take a file that was dropped onto the picture; the answer says in words what became of it."""
+        """Receive a file that was dropped onto the picture; answer with a description of the change."""
         host, name = await self.started(), request.match_info["name"]
         if self._coming >= DROPS:
             return web.Response(status=429, text=f"{DROPS} files are on their way already: wait until one is there\n")
         self._coming += 1
         try:
-            # A bound of its own, for all other requests have none worth the name; and not for ever.
+            # Limits of its own in size and time: other requests have no body of this size.
             async with asyncio.timeout(DROP_SECONDS):
                 data = await request.clone(client_max_size=MOST_BYTES).read()
             words = await self.aside(host.drop, name, data)
@@ -493,7 +493,7 @@ class Server:
             return refused
         except TimeoutError:
             return web.Response(status=408, text=f"{name} took too long\n")
-        except ConnectionError:  # nobody hears it: the sender has gone
+        except ConnectionError:  # the sender has gone; the answer only ends the request
             return web.Response(status=400, text=f"{name} did not come whole\n")
         except SinkError as error:
             return web.Response(status=507, text=f"{error}\n")
@@ -508,7 +508,7 @@ class Server:
         host.watch(-1)
 
     async def _light(self, request: web.Request) -> web.Response:
-        """Return the light's record, its picture, or a face of its cube; what refuses it is the request's fault."""
+        """Answer a request for the light: its record, its picture, or one face of its cube map."""
         stem, _, kind = request.path.rpartition("/")[2].partition(".")
         layout, options = request.query.get("layout", "latlong"), {"axes": _axes(request)}
         if layout not in LAYOUTS:
@@ -559,7 +559,7 @@ class Server:
         return socket
 
     async def _push_light(self, host: Host, socket: web.WebSocketResponse, axes: str) -> None:
-        """Send the light when it has changed; a listener that takes nothing is closed by the heartbeat."""
+        """Send the light's record whenever light or pose have changed; the heartbeat closes a dead listener."""
         from warp_ar.viewer.light_record import describe
 
         sent: tuple[LightState | None, Any] = (None, None)
@@ -577,11 +577,11 @@ class Server:
         """Serve until the host ends or the task is cancelled.
 
         Args:
-            ready: Called with the address once the page can be opened.
-            tries: Ports to try from the address's on.
+            ready: Function called with the address once the page can be opened.
+            tries: Number of ports to try, beginning with the address's port.
 
         Raises:
-            UsageError: The address cannot be listened on.
+            UsageError: No tried port of the address is available.
         """
         self._loop = asyncio.get_running_loop()
         runner = web.AppRunner(self.app, access_log=None, handle_signals=False, shutdown_timeout=0.5)
@@ -595,7 +595,7 @@ class Server:
             self.address = dataclasses.replace(self.address, port=listener.getsockname()[1])
             self.gate.start(runner.server, listener, self.address.tls)
             ready(self.address)
-            # The page is there before kernels, and even their libraries, are loaded.
+            # The page is served before Warp and the kernels are loaded.
             starting = self.aside(functools.partial(self._make_host, publish=self._publish, notify=self._notify))
             self._host = host = await asyncio.shield(starting)
             ticker = asyncio.create_task(self._tick(host))
@@ -616,7 +616,7 @@ class Server:
             self._loop = None
 
     async def _end(self, starting: asyncio.Future[Host] | None, running: asyncio.Future[None] | None) -> bool:
-        """End the host and all threads; return False if one that takes too long is left behind."""
+        """End the host and all threads; return False if a thread still runs after ``STOP_SECONDS``."""
         ended, waited = True, running or starting
         if waited is not None:
             done, _ = await asyncio.wait({waited}, timeout=STOP_SECONDS)
@@ -647,7 +647,7 @@ def _axes(request: web.Request) -> str:
 
 
 def _numbers(request: web.Request) -> dict[str, Any]:
-    """Return the size of a picture, texels, and the number of its mirror ball."""
+    """Return the keys ``size`` (texels; None if not given) and ``ball`` (index of a mirror ball) of a request."""
     expected = {
         "size": (1, LARGEST_FACE, f"1 to {LARGEST_FACE} texels"),
         "ball": (0, 999, "the number of a mirror ball, counted from 0"),
@@ -662,10 +662,10 @@ def _numbers(request: web.Request) -> dict[str, Any]:
 
 
 def check_origin(origin: str) -> str:
-    """Return an origin that may ask for the light, as browsers name it.
+    """Return the origin if it is valid: a scheme and a host without a path.
 
     Raises:
-        UsageError: It is none.
+        UsageError: The origin is not valid.
     """
     scheme, _, rest = origin.partition("://")
     if scheme not in ("http", "https") or not rest or any(c in rest for c in "/?#*@ "):

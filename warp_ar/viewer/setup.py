@@ -1,4 +1,4 @@
-"""Checks of the set-up while its frames are lit, and measurements of ball, response and camera."""
+"""Checks of the user's set-up while its frames are lit, and measurements of ball, response and camera."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from warp_ar.viewer.light_record import written
 from warp_ar.viewer.protocol import Notify, begin, failure
 
 KEPT: Final = 24
-"""Number of kept frames: the newest, with ``STEP_SECONDS`` between them."""
+"""Number of recent frames kept for checks, ``STEP_SECONDS`` apart."""
 STEP_SECONDS: Final = 0.4
 LOST_SECONDS: Final = 1.5
-"""Seconds without the marker after which the reason is searched."""
+"""Time without the marker after which the reason is searched, seconds."""
 AGAIN_SECONDS: Final = 3.0
-"""Seconds between two such tests, and between two tests for a missing ball."""
+"""Time between two such searches, and between two tests for a missing ball, seconds."""
 BALL_SECONDS: Final = 10.0
-"""Seconds between two tests for a visible ball; each takes a third of a second."""
+"""Time between two tests for a visible ball, seconds; each takes a third of a second."""
 PLACES_SECONDS: Final = 1.0
-"""Seconds between two tests for objects in the picture."""
+"""Time between two tests for objects in the picture, seconds."""
 FOCAL_FRAMES: Final = 4
-"""Frames after which a guessed camera's focal length is first looked for."""
+"""Number of frames after which a guessed camera's focal length is first estimated."""
 FOCAL_SPREAD: Final = 0.04
 """Largest relative standard error of a focal length that is used."""
 FOCAL_STEP: Final = 0.01
-"""Share by which a better estimate must differ to be worth another pipeline."""
+"""Relative change of the focal length that is worth a new pipeline."""
 RESPONSE: Final = "response.txt"
 """Name of a measured response's file."""
 NO_BALL: Final = Finding(
@@ -59,7 +59,7 @@ NO_BALL: Final = Finding(
     "“Light by the card”",
 )
 FEWEST: Final = 3
-"""Smallest number of frames for a measurement."""
+"""Smallest number of frames for a step of the set-up."""
 PAGE_WORDS: Final = (
     (r"(?:run )?python -m warp_ar\.calibrate camera PICTURES", "press “Calibrate”"),
     (r"python -m warp_ar\.calibrate ball SCENE --write", "press “Measure the ball”"),
@@ -69,7 +69,7 @@ PAGE_WORDS: Final = (
     (r"DICT_(\w+)", r"family \1"),
     (r"(?:the )?\[\[?([a-z]+)\]\]?", r"the scene’s \1"),
 )
-"""Words on the page for commands, sections of scene files and names of dictionaries."""
+"""(pattern, replacement) pairs that turn commands and scene keys in a finding into words of the page."""
 
 
 @dataclasses.dataclass
@@ -77,26 +77,29 @@ class _Step:
     """Step of the set-up that the page can start."""
 
     work: Callable[[Scene, Look], str]
-    """Function that returns its result in words."""
+    """Function that does the step and returns its result in words."""
     made: object = None
-    """Part of the set-up that the result is about."""
+    """Part of the scene to which the result applies; None before the first result."""
     words: str = ""
-    """The result."""
+    """Result in words."""
     failed: str = ""
-    """Reason of a failure."""
+    """Reason of a failure; empty if there was none."""
 
 
 class SetupChecks:
-    """Keeps some of the frames and looks at them on a helper's thread. The thread of the frames calls ``note``."""
+    """Checks and measurements of recent frames, made on a helper's thread.
+
+    The thread of the frames calls ``note``.
+    """
 
     def __init__(self, controls: Controls, helper: Executor, notify: Notify, folder: Path) -> None:
         """Start without frames.
 
         Args:
-            controls: State that is shown, and taker of measurements.
-            helper: Looks at the frames, beside them.
-            notify: Takes ``message`` whenever it has changed.
-            folder: Folder of a measured response.
+            controls: Shown state, which receives the measurements.
+            helper: Executor of checks and measurements.
+            notify: Receiver of ``message``'s result after every change.
+            folder: Folder for a measured response.
         """
         self._controls, self._helper, self._notify, self._path = controls, helper, notify, folder / RESPONSE
         works = {"check": self._check, "ball": self._ball, "light": self._light, "response": self._response}
@@ -112,28 +115,28 @@ class SetupChecks:
         self._start(0.0)
 
     def _start(self, now: float) -> None:
-        """Forget the frames: they are of another source or marker."""
+        """Forget the frames after a change of source or marker."""
         self._frames.clear()
         self._count, self._focal_due = 0, FOCAL_FRAMES
         self._seen, self._looked, self._placed, self._ball_looked = now, -math.inf, -math.inf, -math.inf
         self.missing: Finding | None = None
-        """Finding of a marker that is not seen, or is one of a board's; None while all is right."""
+        """Finding that the marker is not seen, or belongs to a board; None otherwise."""
         self.outside: Finding | None = None
-        """Finding that all virtual objects lie outside the picture; None while it shows one."""
+        """Finding that all virtual objects lie outside the picture; None otherwise."""
         self.ball = ""
-        """``seen``, ``missing`` or ``outside`` the picture; empty where the scene reads no mirror ball."""
+        """``seen``, ``missing`` or ``outside`` (the picture); empty if the scene uses no mirror ball."""
 
     def note(
         self, image: Image, state: TrackState | None, pose: Pose | None, now: float, *, rests: bool = False
     ) -> None:
-        """Take notice of a frame.
+        """Keep a lit frame for checks, and start the checks that are due.
 
         Args:
-            image: As the camera gave it, RGB.
-            state: State of the marker; None where nothing looked for it.
-            pose: ``camera_from_world``; None where it is not known.
-            now: Seconds on a clock that does not jump.
-            rests: Begin no look that nobody asked for: the helper looks for the board.
+            image: Picture of the camera, RGB.
+            state: State of marker tracking; None if no stage tracked the marker.
+            pose: ``camera_from_world``; None if unknown.
+            now: Time on a monotonic clock, seconds.
+            rests: True starts no automatic checks, as the helper is searching for the calibration board.
         """
         of = (self._controls.feed.source, self._controls.wanted.scene.marker)
         if self._of is None or of != self._of:
@@ -153,18 +156,18 @@ class SetupChecks:
         tracked = state is TrackState.TRACKED
         if tracked or state is None:
             self._seen = now
-            # A single marker that is seen may be one of a board's, which is looked at below.
+            # A visible single marker may belong to a board, which is tested below.
             if self.missing is not None and self.missing.name != "marker.board":
                 self.missing = None
         if not rests:
             self._begin_looks(image, now, tracked=tracked)
 
     def _begin_looks(self, image: Image, now: float, *, tracked: bool) -> None:
-        """Begin the look that is due, one at a time: for the focal length, or for the marker and the ball."""
+        """Start the check that is due, one at a time: of the focal length, or of marker and ball."""
         if self._busy is not None and not self._busy.done():
             return
         if self._guesses and self._count >= self._focal_due:
-            # When twice as many frames have come, and later whenever all that are kept are new.
+            # Again when the number of frames has doubled, later whenever all kept frames are new.
             self._focal_due = self._count + min(self._count, KEPT)
             self._busy = begin(self._helper, self._notify, self._estimate_focal, self._controls.feed)
         elif (tracked or now - self._seen > LOST_SECONDS) and now - self._looked > AGAIN_SECONDS:
@@ -181,7 +184,7 @@ class SetupChecks:
         return dataclasses.replace(wanted.scene, camera=camera), camera
 
     def _find_outside(self, pose: Pose) -> Finding | None:
-        """Return the finding that the picture shows none of the objects, if so."""
+        """Return the finding that all objects lie outside the picture; None if one lies inside."""
         try:
             scene, camera = self._shown()
         except WarpArError:
@@ -191,7 +194,13 @@ class SetupChecks:
         return next(iter(check_objects(scene, camera, [pose])), None)
 
     def _look(self, image: Image, tracked: bool, for_ball: bool) -> None:
-        """Find why the marker is not seen; of one that is, whether it belongs to a board, and whether a ball is too."""
+        """Update ``missing`` and ``ball`` by one frame.
+
+        Args:
+            image: Picture of the camera.
+            tracked: True if the marker is tracked; otherwise the reason for its absence is searched.
+            for_ball: True also tests for the mirror ball.
+        """
         of, missing, ball = self._of, None, self.ball
         with contextlib.suppress(WarpArError, IndexError):  # the source has changed meanwhile
             scene, camera = self._shown()
@@ -203,11 +212,11 @@ class SetupChecks:
                 missing = None if look.views else why_unseen(scene.marker, look)
             if for_ball:
                 ball = self._ball_in(look_at(scene.marker, camera, [(image, 0.0)]), scene)
-        if of is self._of:  # else the marker or the source has changed meanwhile
+        if of is self._of:  # otherwise the result is of another marker or source
             self.missing, self.ball = missing, ball
 
     def _ball_in(self, look: Look, scene: Scene) -> str:
-        """Return ``ball`` as one frame shows it."""
+        """Return the value of ``ball`` for one frame."""
         if not self._controls.wanted.shown_scene().probes or scene.captured is not None:
             return ""
         if not any(is_in_view(look, pose, probe) for _, pose in look.views for probe in scene.probes):
@@ -216,13 +225,13 @@ class SetupChecks:
 
     @property
     def _guesses(self) -> bool:
-        """True while frames come from a browser's camera that nobody calibrated."""
+        """True while frames come from a browser's camera that has not been calibrated."""
         feed = self._controls.feed
         return feed.is_browser and self._controls.wanted.camera_of(feed.source.size) is None
 
     @property
     def estimating(self) -> bool:
-        """True while the focal length of a guessed camera is still unknown."""
+        """True while the focal length of a browser's camera is only guessed."""
         return self._guesses and not self._controls.feed.estimated
 
     def _estimate_focal(self, feed: Feed) -> None:
@@ -231,7 +240,7 @@ class SetupChecks:
             self._take_focal(scene, look_at(scene.marker, camera, list(self._frames)), feed)
 
     def _take_focal(self, scene: Scene, look: Look, feed: Feed) -> None:
-        """Use the focal length that frames tell, where they tell it well enough."""
+        """Estimate the focal length from frames, and use it if it is accurate enough."""
         fit, camera = measure_focal(scene.marker, look), look.camera
         if fit is None or fit.deviation > FOCAL_SPREAD or abs(fit.ratio - 1.0) < FOCAL_STEP * feed.estimated:
             return
@@ -242,10 +251,10 @@ class SetupChecks:
     # ----------------------------------------------------------------------------------------------------------- steps
 
     def step(self, step: str) -> None:
-        """Begin to look at the frames, or to measure by them, as soon as there are enough.
+        """Start a step of the set-up as soon as there are enough frames.
 
         Raises:
-            UsageError: It is at that already.
+            UsageError: Another step is running.
         """
         if self._step is not None:
             raise UsageError("the frames are being looked at already: wait until that is done")
@@ -258,7 +267,8 @@ class SetupChecks:
         try:
             scene, camera = self._shown()
             step.words = step.work(scene, look_at(scene.marker, camera, list(self._frames)))
-            # Where the check has changed the camera, or a step what it measured, the result is about what is now.
+            # A step may have changed the scene (a check with a guessed camera, a measurement): the result applies to
+            # the changed scene.
             step.made = _state_of(scene if name == "check" and not self._guesses else self._shown()[0])[name]
         except WarpArError as error:
             step.failed = _page_words(str(error))
@@ -267,7 +277,7 @@ class SetupChecks:
             self._notify(self.message())
 
     def _tell(self, words: str) -> None:
-        """Say what is being looked at."""
+        """Show the progress of a step."""
         self._doing = words
         self._notify(self.message())
 
@@ -280,7 +290,7 @@ class SetupChecks:
         return ""
 
     def _valid(self) -> frozenset[str]:
-        """Return the steps whose results the present set-up holds, so that undo and redo follow them."""
+        """Return the steps whose results apply to the present scene; undo and redo change them."""
         made = {name: step.made for name, step in self._steps.items() if step.made is not None}
         try:
             now = _state_of(self._shown()[0]) if made else {}
@@ -289,7 +299,7 @@ class SetupChecks:
         return frozenset(name for name, state in made.items() if now[name] == state)
 
     def _ball(self, scene: Scene, look: Look) -> str:
-        """Measure the first mirror ball and put it where it stands."""
+        """Measure the place and radius of the first mirror ball, and set them in the scene."""
         if not scene.probes:
             raise UsageError("the scene has no mirror ball: use the printed card, or add one to its file")
         if len(look.views) < FEWEST:
@@ -318,7 +328,7 @@ class SetupChecks:
         )
 
     def _light(self, scene: Scene, look: Look) -> str:
-        """Light the scene by what the newest frame's card and other surfaces show."""
+        """Light the scene with the light estimated from the card and other surfaces in the newest frame."""
         if not look.views:
             raise UsageError("the marker was not seen: have all of the card in the picture")
         found = light_by_card(look.views[-1][0], scene, look.views[-1][1])
@@ -332,7 +342,7 @@ class SetupChecks:
         return found.words
 
     def _response(self, scene: Scene, look: Look) -> str:
-        """Measure how the camera encodes light, by the card's greys."""
+        """Measure the camera's response from the grey patches of the card."""
         found = measure_grey_response(look.images)
         interval = 2 * found.deviation[128].max()
         if interval > MOST_DEVIATION:
@@ -352,14 +362,14 @@ class SetupChecks:
         """Return the measured response.
 
         Raises:
-            UsageError: None was measured.
+            UsageError: No response was measured.
         """
         if not self._steps["response"].words:
             raise UsageError("no response was measured here")
         return self._path.read_bytes()
 
     def message(self) -> dict[str, Any]:
-        """Return the findings and measurements."""
+        """Return the message of findings and measurements for the page."""
         self._told = valid = self._valid()
         findings = None
         if "check" in valid:
@@ -376,13 +386,13 @@ class SetupChecks:
         }
 
     def guide(self) -> dict[str, str] | None:
-        """Return what is missing in the picture, and what to do; None while all is right."""
+        """Return the most important finding about the picture, with its remedy; None if there is none."""
         found = self.missing or self.outside or (NO_BALL if self.ball == "missing" else None)
         return None if found is None else page_record(found)
 
 
 def _state_of(scene: Scene) -> dict[str, object]:
-    """Return the part of a scene that each step's result is about."""
+    """Return, by the name of each step, the part of the scene to which its result applies."""
     ball = scene.probes[0] if scene.probes else None
     return {
         "ball": ball and (ball.center, ball.radius),
@@ -393,31 +403,34 @@ def _state_of(scene: Scene) -> dict[str, object]:
 
 
 def page_record(finding: Finding) -> dict[str, str]:
-    """Return a finding for the page."""
+    """Return a finding's name, text and remedy, in words of the page."""
     return {"name": finding.name, "text": _page_words(finding.text), "remedy": _page_words(finding.remedy)}
 
 
 def _page_words(text: str) -> str:
-    """Return a finding's words with the page's own for those of commands and files."""
+    """Replace commands and scene keys in a text by words of the page."""
     for command, words in PAGE_WORDS:
         text = re.sub(command, words, text)
     return text
 
 
 _BOARD_SECONDS: Final = 0.4
-"""Time between two looks for the board."""
+"""Time between two searches for the board, seconds."""
 
 
 class CalibrationSession:
-    """Collects views of the board. ``look`` is called by the thread of the frames, all else by any."""
+    """Calibration of the camera from views of the board.
+
+    The thread of the frames calls ``look``; other methods may be called from any thread.
+    """
 
     def __init__(self, helper: Executor, notify: Notify, use: Callable[[Camera], None]) -> None:
         """Start without a calibration.
 
         Args:
-            helper: Looks for the board, beside the frames.
-            notify: Takes ``message`` whenever it has changed.
-            use: Takes the calibrated camera, whose transfer is still that of a board's pictures.
+            helper: Executor of the search for the board.
+            notify: Receiver of ``message``'s result after every change.
+            use: Receiver of the calibrated camera. Its transfer function is not measured.
         """
         self._helper, self._notify, self._use = helper, notify, use
         self._views: BoardViews | None = None
@@ -431,18 +444,18 @@ class CalibrationSession:
         return self._views is not None
 
     def step(self, step: str) -> None:
-        """Start, stop or finish.
+        """Start, stop or finish the calibration.
 
         Raises:
-            WarpArError: There is nothing to finish, or what was seen tells too little: looking goes on.
+            WarpArError: No calibration was started, or the views do not suffice. Collecting views continues.
         """
         if step == "finish":
-            seen = self._views  # once: another viewer may finish or stop it meanwhile
+            seen = self._views  # read once, as another viewer may finish or stop meanwhile
             if seen is None:
                 raise UsageError("nothing was looked at yet: start the calibration first")
             report = seen.solve()
             if report.doubt:
-                # The views stay, for more of them to be added.
+                # The views are kept, so that more can be added.
                 views = len(report.view_errors)
                 raise UsageError(f"{report.doubt}, in {views} views: nothing is used. Show the card from other sides")
             self._report = report
@@ -451,7 +464,7 @@ class CalibrationSession:
         self._notify(self.message())
 
     def look(self, image: Image) -> None:
-        """Have a frame looked at; newer ones are left aside meanwhile."""
+        """Search a frame for the board in the background; frames that arrive during a search are skipped."""
         views, now = self._views, time.monotonic()
         if views is None or now - self._looked < _BOARD_SECONDS:
             return
@@ -472,7 +485,7 @@ class CalibrationSession:
             self._notify(self.message())
 
     def message(self) -> dict[str, Any]:
-        """Return how far the calibration has come."""
+        """Return the message of the calibration's progress and result."""
         views, report = self._views, self._report
         told = None
         if report is not None:
@@ -496,7 +509,7 @@ class CalibrationSession:
         """Return the calibrated camera as OpenCV's YAML.
 
         Raises:
-            UsageError: None was calibrated.
+            UsageError: No camera was calibrated.
         """
         report = self._report
         if report is None:
@@ -505,5 +518,5 @@ class CalibrationSession:
 
 
 def card_pdf(paper: str) -> bytes:
-    """Return the card to print, a PDF."""
+    """Return the printable card as a PDF, for paper ``a4`` or ``letter``."""
     return written("card.pdf", lambda path: write_card(SHEET, path, paper))

@@ -1,8 +1,9 @@
 """Files that a viewer drops onto the picture (meshes, captured light, scenes), and scenes packed with their files.
 
-Nothing of them is trusted. A file's name chooses how it is read and is shown again, nothing else; what it holds is kept
-in the page's own temporary folder, within limits, and goes with it. A scene may name no file but those of the scene
-that is shown, and a mesh none but those that come with it: through the page nobody reads what lies on this machine.
+Dropped files are not trusted. A file's name only selects its reader and appears in messages. The content is kept in a
+temporary folder of the page, within limits, until the program ends. A dropped scene may name only files of the shown
+scene and files dropped before, a dropped mesh only files of its own folder. So the page gives no access to other files
+of this machine.
 """
 
 from __future__ import annotations
@@ -31,22 +32,22 @@ from warp_ar.viewer.protocol import MOST_BYTES
 
 SCENE: Final = "scene.toml"
 MOST_MEMBERS: Final = 256
-"""Files of a ZIP that is taken."""
+"""Largest number of files in a ZIP."""
 _KINDS: Final = {*MESH_SUFFIXES, ".mtl", ".bin", ".exr", ".hdr", ".txt", ".json", ".usda", ".usdc", ".usd"} | {
     *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif", ".ppm", ".ktx2")
 }
-"""Endings of files that a scene names."""
+"""Endings of files that a scene may name."""
 LONGEST_NAME: Final = 200
-"""Characters of a member's name with its folders."""
+"""Largest number of characters of a ZIP member's path."""
 MOST_LEVELS: Final = 8
-"""Folders within each other that a member may lie in."""
+"""Largest number of nested folders in a ZIP member's path."""
 _T = TypeVar("_T")
 
 
 def pack_scene(scene: Scene) -> bytes:
-    """Return the scene as ``scene.toml``, and beside it its meshes with their materials, its light, response and poses.
+    """Return a ZIP of the scene: ``scene.toml`` with its meshes and their materials, light, response and poses.
 
-    A video or a folder of frames is not packed, nor named: it may be gigabytes.
+    A source that is a video or a folder of frames is left out, as it may have gigabytes.
 
     Raises:
         WarpArError: A file cannot be read.
@@ -74,27 +75,27 @@ def pack_scene(scene: Scene) -> bytes:
 
 
 _HIDDEN: Final = re.compile(r"(^|/)(__MACOSX/|\.(?!\.?/))")
-"""Files that macOS puts beside those that are packed: ``__MACOSX``, ``._NAME``, ``.DS_Store``."""
+"""Pattern of the files that macOS adds to a ZIP: ``__MACOSX``, ``._NAME``, ``.DS_Store``."""
 
 
 def unpack_scene(name: str, data: bytes, folder: Path, most: int) -> Path:
-    """Unpack such a ZIP; return the path of its scene file.
+    """Unpack a ZIP of ``pack_scene``; return the path of its scene file.
 
     Args:
-        name: To show.
-        data: The ZIP; nothing of it is trusted.
-        folder: Empty folder for its files.
-        most: Bytes that it may unpack to.
+        name: Name of the ZIP in messages.
+        data: Content of the ZIP, which is not trusted.
+        folder: Empty folder for the unpacked files.
+        most: Largest unpacked size, bytes.
 
     Raises:
-        UsageError: It is none, or too large.
+        UsageError: The ZIP is invalid or too large.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             found = (member for member in file.infolist() if not member.is_dir())
             members = [member for member in found if not _HIDDEN.search(member.filename)]
             _check_members(name, members, most)
-            file.extractall(folder, members)  # which reads no more than the headers say
+            file.extractall(folder, members)  # reads no more bytes than the checked headers state
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
         raise UsageError(f"{name}: no ZIP that can be unpacked: {str(error)[:120]}") from error
     return folder / SCENE
@@ -122,7 +123,7 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
 
 
 def _beside(name: str) -> str:
-    """Return the place of a file beside the mesh that names it: its own name where that stays inside."""
+    """Return the relative path at which a mesh's own file is packed: as the mesh names it, if that is safe."""
     plain = name.strip().replace("\\", "/")
     inside = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", plain) and ".." not in PurePosixPath(plain).parts
     return plain if inside else plain.rsplit("/", 1)[-1]
@@ -135,41 +136,40 @@ def _plain(stem: str) -> str:
 MOST_FILES: Final = 32
 """Largest number of dropped files in one run; files of undone edits are kept for redo."""
 MOST_KEPT_BYTES: Final = 1 << 29
-"""Largest total of bytes of dropped files in one run: 512 MB."""
+"""Largest total size of dropped files in one run, bytes: 512 MB."""
 MOST_TRIANGLES: Final = 1_000_000
-"""Largest number of triangles of a dropped mesh; more take the page too long."""
+"""Largest number of triangles of a dropped mesh."""
 SIZES: Final = (0.02, 0.4)
-"""Smallest and largest longest side of an object, metres."""
+"""Plausible range of an object's longest side, metres, by which the units of a mesh are guessed."""
 USUAL: Final = 0.12
-"""Longest side, metres, given to a mesh of unknown units."""
+"""Longest side given to a mesh whose units cannot be guessed, metres."""
 PLACE: Final = (0.12, -0.08)
 """Place of a dropped mesh, metres."""
 LIGHTS: Final = (".exr", ".hdr")
 SUFFIXES: Final = (*MESH_SUFFIXES, *LIGHTS, ".toml", ".zip")
 
 Edit = tuple[Callable[[Wanted], Wanted], str, str]
-"""Function from the wanted state to the next, its name as an edit, and the words about it."""
+"""Edit of the wanted state: the function from the present state to the next, its label, and its description."""
 
 
 class DroppedFiles:
-    """Storage of dropped files, one at a time."""
+    """Storage of dropped files. The caller passes one file at a time."""
 
     def __init__(self, folder: Path) -> None:
-        """Keep files in numbered folders of ``folder``, which must be there."""
+        """Store files in numbered folders of ``folder``, which must exist."""
         self._folder, self._count = folder, 0
 
     def take(self, name: str, data: bytes, wanted: Wanted) -> Edit:
-        """Keep a file and return the edit that it makes.
+        """Store a file and return the edit that adds it to the scene. After an error nothing of the file is kept.
 
         Args:
-            name: The file's own name.
-            data: Its content.
-            wanted: The state that is shown now.
+            name: Name of the file.
+            data: Content of the file.
+            wanted: Shown state.
 
         Raises:
-            UsageError: It is none that can be used.
-            SinkError: The disk is full, or the file cannot be written for another reason.
-                In no case of an error is anything of the file kept.
+            UsageError: The file cannot be used.
+            SinkError: The file cannot be written, for example because the disk is full.
         """
         suffix = Path(name).suffix.lower()
         if suffix not in SUFFIXES:
@@ -182,8 +182,8 @@ class DroppedFiles:
             raise UsageError(f"{MOST_FILES} files were dropped already; start the program anew for more")
         stem = _plain(Path(name).stem)
         if any(self._folder.glob(f"*/{stem}{suffix}")):
-            stem += f"-{self._count + 1}"  # a saved scene names it by its name alone
-        # Each in a folder of its own, with all that is made of it: nothing else is to be removed where it is refused.
+            stem += f"-{self._count + 1}"  # a saved scene names files without folders, so names must be unique
+        # Each file has its own folder, with all that is unpacked from it, so that a refusal removes just this folder.
         place = self._folder / f"{self._count:02d}"
         path = place / f"{stem}{suffix}"
         try:
@@ -200,7 +200,7 @@ class DroppedFiles:
             shutil.rmtree(place, ignore_errors=True)
             if isinstance(error, OSError):
                 raise SinkError(f"{_shown(name)} cannot be kept: {reason(error)}") from error
-            if isinstance(error, WarpArError):  # the folder is nobody's business
+            if isinstance(error, WarpArError):  # viewers see the file's name without this machine's folders
                 words = re.sub(rf"{re.escape(str(path.with_suffix('')))}(\.\w+)?", _shown(name), str(error))
                 raise UsageError(words.replace(str(place), _shown(name))) from error
             raise
@@ -214,7 +214,7 @@ class DroppedFiles:
             raise UsageError(f"{name}: not valid TOML: {str(error)[:160]}") from error
         folder = Path() if wanted.scene.path is None else wanted.scene.path.parent
         files = _files(folder, (), wanted)
-        # As a file that was saved here names what was dropped or measured before.
+        # A scene saved by the page names files that were dropped or measured before; find them by their names.
         shown = [path for path in files_of(wanted.scene) if path.is_relative_to(self._folder)]
         dropped = {path.name: path for path in (*self._folder.glob("[0-9][0-9]/*"), *shown) if path.is_file()}
         files = dataclasses.replace(files, names=dropped)
@@ -222,7 +222,7 @@ class DroppedFiles:
         return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
 
     def _check_room(self, more: int) -> None:
-        """Refuse a file with which more would be kept than may be."""
+        """Raise a UsageError if ``more`` bytes would exceed the limit of stored bytes."""
         kept = more + sum(file.stat().st_size for file in self._folder.glob("[0-9][0-9]/**/*") if file.is_file())
         if kept > MOST_KEPT_BYTES:
             raise UsageError(
@@ -235,7 +235,7 @@ def _megabytes(count: int) -> str:
 
 
 def _shown(name: str) -> str:
-    """Return a file's name as it may be shown: short, and on one line."""
+    """Return a file's name for messages: at most 60 plain characters, without folders."""
     return re.sub(r"[^\w .()-]+", "_", Path(name).name)[:60]
 
 
@@ -247,12 +247,12 @@ def _mesh_edit(name: str, path: Path, wanted: Wanted) -> Edit:
     longest = float((high - low).max())
     if not longest > 0.0:
         raise SceneError(f"{name}: all of it is at one point")
-    # Files are in metres, or in millimetres as printers have it, or in nobody knows what.
+    # Files are usually in metres, or in millimetres if meant for 3D printers; otherwise units are unknown.
     scale = next((unit for unit in (1.0, 0.001) if SIZES[0] <= longest * unit <= SIZES[1]), USUAL / longest)
     middle = (low + high) / 2
     at = (PLACE[0] - scale * middle[0], PLACE[1] - scale * middle[1], -scale * low[2])
     item = Object("mesh", file=path, at=_rounded(at), scale=float(f"{scale:.6g}"))
-    add_item(wanted.scene, "object", item)  # whatever refuses it does so now
+    add_item(wanted.scene, "object", item)  # raises its errors now, before the file is accepted
     sides = " x ".join(f"{1e3 * scale * side:.0f}" for side in high - low)
     units = {1.0: "metres", 0.001: "millimetres"}.get(scale, "units of its own, so its longest side is 120 mm")
     words = f"{name}: {len(mesh.faces):,} triangles, {sides} mm, taken to be in {units}."
@@ -279,7 +279,7 @@ def _light_edit(name: str, path: Path) -> Edit:
 
 
 def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
-    """A scene with all that it names."""
+    """Return the edit that opens a scene from a ZIP of the scene and its files."""
     path = unpack_scene(name, data, folder, MOST_BYTES)
     own = [file for file in folder.rglob("*") if file.is_file()]
     scene = load_scene(path, _files(path.parent, own, wanted))
@@ -291,7 +291,7 @@ def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
 
 
 def _files(folder: Path, own: Iterable[Path], wanted: Wanted) -> SceneFiles:
-    """Return the files that a dropped scene may name: its own, and those of the scene that is shown."""
+    """Return the files that a dropped scene may name: its own and the shown scene's."""
     source = wanted.scene.source
     cameras = () if source is None or source.camera is None else (source.camera,)
     return SceneFiles.of(folder, [*own, *files_of(wanted.scene)], cameras)
