@@ -81,7 +81,7 @@ def rings(ratio, away):
 def traced(material, folder):
     scene, picture, away = world(material, folder)
     tracer = PathTracer(scene, light(1.0), picture, given_pose(scene.pose, 0), device="cpu")
-    tracer.sample(64)
+    tracer.sample(16)
     return rings(tracer.picture().radiance / tracer.frame(), away)
 
 

@@ -37,36 +37,6 @@ def test_one_thread_at_a_time_on_cuda_and_all_on_cpu() -> None:
     assert not held_by_another(SimpleNamespace(is_cuda=False), 60.0)
 
 
-class _Cuda:
-    """A CUDA device whose context takes a while."""
-
-    is_cuda = True
-
-    def __init__(self) -> None:
-        self.opened, self.may_open, self.threads = threading.Event(), threading.Event(), []
-
-    def __str__(self) -> str:
-        return "cuda:0"
-
-    @property
-    def context(self) -> int:
-        self.threads.append(threading.current_thread())
-        assert self.may_open.wait(60.0)
-        self.opened.set()
-        raise RuntimeError("no memory")
-
-
-@pytest.fixture
-def cuda(monkeypatch) -> _Cuda:
-    """The one CUDA device of the machine."""
-    found = _Cuda()
-    monkeypatch.setattr(device, "_OPENING", [])
-    monkeypatch.setattr(device, "start_warp", lambda: None)
-    monkeypatch.setattr(device.wp, "get_devices", lambda: [SimpleNamespace(is_cuda=False), found])
-    monkeypatch.setattr(device.wp, "get_device", lambda name: found)
-    return found
-
-
 class _Event:
     """An event of a CUDA device that comes to pass at some look, or never."""
 

@@ -193,7 +193,7 @@ def test_codes_that_end_early_are_seen(fault, clip, looks):
 
 
 def test_a_ball_that_is_half_hidden_is_seen(looks):
-    scene, look = load_scene("desk"), dataclasses.replace(looks["desk"], views=looks["desk"].views[:4])
+    scene, look = load_scene("desk"), dataclasses.replace(looks["desk"], views=looks["desk"].views[:2])
 
     def hidden(share: float) -> list[str]:
         """Findings where a hand covers the balls from above, down to ``share`` of the radius below the centre."""

@@ -37,7 +37,7 @@ def test_run_to_run_and_in_any_bands(rig_for, stage, method):
     rig = rig_for(stage, method)
     state = rig.state()
     first = rig.run(stage)
-    for bands in range(1, 17):
+    for bands in (1, 2, 5, 16):
         rig.restore(state)
         assert_same_bits(first, rig.run(stage, bands=bands))
 
