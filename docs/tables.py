@@ -184,11 +184,11 @@ def plot(path: pathlib.Path | None = None) -> str:
     if any("ms" not in whole for whole in presets.values()):
         return ""
     if path is not None:
-        from warp_ar.accuracy.charts import Point, scatter, stand_alone
+        from warp_ar.accuracy.charts import Point, scatter
 
         points = [Point(name, whole["ms"], whole["error"], False) for name, whole in presets.items()]
         chart = scatter(points, "milliseconds per frame", "error: FLIP to the truth, per changed pixel", 1e3 / 30.0)
-        path.write_text(stand_alone(chart), encoding="utf-8")
+        path.write_text(chart, encoding="utf-8")
     return "![Error over milliseconds of the presets on the bundled desk](accuracy.svg)"
 
 

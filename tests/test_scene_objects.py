@@ -8,11 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from tests.test_pipeline import SPARED, Frames, frames, make_scene, run
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.scene import AreaLight, LambertMaterial, MirrorMaterial, Object, Scene, dumps_scene, loads_scene
+from warp_ar.scene import (
+    AreaLight,
+    LambertMaterial,
+    MirrorMaterial,
+    Object,
+    Scene,
+    dumps_scene,
+    loads_scene,
+)
+from warp_ar.scene.geometry import make_mesh
 from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow
@@ -93,6 +103,35 @@ def test_poses_come_back() -> None:
         assert pipeline.scene.objects[0].radius == 0.01
 
 
+def flat(corners: np.ndarray) -> Object:
+    """Return an object of triangles (m, 3, 3), each with its own normal."""
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.repeat(across / np.linalg.norm(across, axis=1, keepdims=True), 3, axis=0)
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    mesh = make_mesh(corners.reshape(-1, 3), faces, normals)
+    return Object("mesh", mesh=mesh, material=LambertMaterial((0.2, 0.5, 0.9)), name="wedge")
+
+
+def test_a_sheared_mesh_equals_one_with_sheared_vertices(frames: Frames) -> None:
+    """And moving it without another shear writes numbers in place."""
+    shear, there = np.array([[1.0, 0.5, 0, 0], [0, 0.7, 0, 0], [0, 0, -1.5, 0], [0, 0, 0, 1]]), np.eye(4)
+    there[:3] = UPRIGHT[:3]
+    corners = trimesh.creation.cylinder(radius=0.02, height=0.03, sections=9).triangles
+    with Pipeline(make_scene(objects=(flat(corners),)), device="cpu", quality="low") as pipeline:
+        wedge = pipeline.objects["wedge"]
+        wedge.world_from_object = shear
+        np.testing.assert_allclose(wedge.world_from_object, shear, atol=1e-9)
+        _ = pipeline(frames[0]).image
+        arrays = pipeline.arrays
+        wedge.world_from_object = there @ shear
+        image = pipeline(frames[0], time_seconds=0.1).image.copy()
+        assert pipeline.arrays is arrays
+    moved = trimesh.transform_points(corners.reshape(-1, 3), there @ shear).reshape(-1, 3, 3)
+    with Pipeline(make_scene(objects=(flat(moved[:, ::-1]),)), device="cpu", quality="low") as new:
+        expected = run(new, [frames[0], frames[0]])[1].image
+    assert (np.abs(image.astype(int) - expected) > SPARED).mean() < 1e-4, "but for rays that graze an edge"
+
+
 @pytest.fixture(scope="module")
 def standing() -> Iterator[Pipeline]:
     with Pipeline(named(), device="cpu", quality="low") as pipeline:
@@ -110,7 +149,7 @@ def standing() -> Iterator[Pipeline]:
         (lambda all_: all_.add(Object("mesh", file=Path("gone.glb"))), SceneError, "gone.glb"),
         (lambda all_: all_.add(dataclasses.replace(BALL, at=(np.nan, 0.0, 0.0))), SceneError, "finite"),
         (lambda all_: all_["lamp"].place((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)), SceneError, "with a length"),
-        (lambda all_: all_["lamp"].place((0.0, 0.0, 0.0), scale=-1.0), SceneError, "world_from_object"),
+        (lambda all_: all_["lamp"].place((0.0, 0.0, 0.0), scale=-1.0), SceneError, "expected a mesh"),
         (lambda all_: all_["lamp"].place("abc"), SceneError, "expected 3 numbers"),
         (lambda all_: all_["lamp"].place((0.0, 0.0, 0.0), scale=None), SceneError, "finite numbers"),
         (lambda all_: all_.add(dataclasses.replace(BALL, at=np.full(3, np.nan))), SceneError, "finite"),

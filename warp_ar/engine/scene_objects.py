@@ -112,39 +112,40 @@ class SceneObject:
 
     @property
     def world_from_object(self) -> npt.NDArray[np.float64]:
-        """Pose and uniform scale before animation, (4, 4), metres, in the frame of the object's own marker if any.
+        """Affine transform before animation, (4, 4), metres, in the frame of the object's own marker if any.
 
         Raises:
             SceneError: The new value is no such matrix (``object_at``).
         """
         item, matrix = self.value, np.eye(4)
         rotation, matrix[:3, 3] = dataclasses.replace(item, animate=None).pose_at(0.0)
-        matrix[:3, :3] = item.scale * rotation
+        matrix[:3, :3] = item.scale * rotation @ item.stretch_matrix()
         return matrix
 
     @world_from_object.setter
     def world_from_object(self, matrix: Any) -> None:
         self._replace(lambda item: object_at(item, matrix))
 
-    def place(self, translation: Any, quaternion: Any = (0.0, 0.0, 0.0, 1.0), scale: float = 1.0) -> None:
+    def place(self, translation: Any, quaternion: Any = (0.0, 0.0, 0.0, 1.0), scale: Any = 1.0) -> None:
         """Place the object by translation, rotation and scale, as in a glTF node.
 
         Args:
             translation: Position in metres, (3,).
             quaternion: Rotation as x, y, z, w, of any length but 0.
-            scale: Factor on all lengths.
+            scale: Factor on all lengths, or of a mesh one for each axis, (3,).
 
         Raises:
-            SceneError: A number is not finite, the quaternion has no length, or the scale is not above 0.
+            SceneError: A number is not finite, the quaternion has no length, or a scale cannot be used.
         """
         try:
             given = [np.asarray(value, np.float64) for value in (translation, quaternion, scale)]
         except (TypeError, ValueError):
             given = []
         length = np.linalg.norm(given[1]) if given else 0.0
-        if [value.shape for value in given] != [(3,), (4,), ()] or not 0.0 < length < np.inf:
-            raise SceneError("place: expected 3 numbers, a quaternion x, y, z, w with a length, and one scale")
-        self.world_from_object = NodeTrack(given[0], given[1] / length, np.full(3, given[2]), {}).transform_at(0.0)
+        fits = [value.shape for value in given] in ([(3,), (4,), ()], [(3,), (4,), (3,)])
+        if not fits or not 0.0 < length < np.inf:
+            raise SceneError("place: expected 3 numbers, a quaternion x, y, z, w with a length, and 1 or 3 scales")
+        self.world_from_object = NodeTrack(given[0], given[1] / length, given[2], {}).transform_at(0.0)
 
     @property
     def material(self) -> Material:

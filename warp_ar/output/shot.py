@@ -38,6 +38,7 @@ from warp_ar.scene.materials import (
 )
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.object_materials import materials_of
+from warp_ar.scene.object_materials import mesh_of as object_mesh
 from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements, surface_names
 from warp_ar.scene.shapes import box_mesh, disk_mesh, sphere_mesh, torus_mesh, tube_mesh
 from warp_ar.scene.textures import load_emission, load_texture
@@ -295,11 +296,11 @@ def _turn_to(direction: Matrix) -> Matrix:
 
 def mesh_of(item: Object | Proxy) -> Mesh:
     """Return the triangles of an object or a proxy, before scale and pose."""
-    if isinstance(item, Object) and item.mesh is not None:
-        return item.mesh
-    if item.file is not None:
+    if item.file is not None and isinstance(item, Proxy):
         return load_mesh(item.file)
     if isinstance(item, Object):
+        if (mesh := object_mesh(item)) is not None:
+            return mesh
         match item.shape:
             case "sphere":
                 return sphere_mesh(item.radius)

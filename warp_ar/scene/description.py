@@ -203,6 +203,8 @@ class GridBoard:
 
 
 Board: TypeAlias = CharucoBoard | GridBoard
+FLATTEST: Final = 1e5
+"""Ratio of the longest to the shortest image of a unit vector above which a stretched mesh is too flat for rays."""
 SIDES: Final = {"plane": 2, "rect": 2, "box": 3}
 """Number of values that ``size`` needs, by shape."""
 
@@ -374,11 +376,11 @@ class Play(Checked):
 class Object(Checked):
     """Virtual object.
 
-    A point p of its shape is at R (scale p) + at in the world. Fields that its shape does not use are zero.
+    A point p of its shape is at R (scale stretch p) + at in the world. Fields that its shape does not use are zero.
     """
 
     USES: ClassVar = {
-        "mesh": ("file",),
+        "mesh": ("file", "stretch"),
         "sphere": ("radius",),
         "box": ("size",),
         "torus": ("major_radius", "minor_radius"),
@@ -408,6 +410,8 @@ class Object(Checked):
     """Degrees about the fixed x, then y, then z axis."""
     scale: Annotated[float, Key("-", "0.026", low=SMALLEST)] = 1.0
     """Factor on all lengths."""
+    stretch: Annotated[tuple[float, ...] | None, Key("-", "[1, 0.2, 0, 0, 1, 0, 0, 0, -1]", sizes=(9,))] = None
+    """Invertible 3x3 matrix, by rows, that maps a mesh before ``scale``."""
     material: Annotated[Material, Key("-", '{ model = "mirror" }')] = OF_THE_FILE
     """Material."""
     animate: Motion = None
@@ -426,9 +430,21 @@ class Object(Checked):
         super().__post_init__()
         if self.shape == "mesh" and self.file is None and self.mesh is None:
             fail(self, "file", "a mesh needs its file, or a mesh in memory as object_from_trimesh gives")
+        if self.stretch is not None and self.shape != "mesh":
+            fail(
+                self,
+                "stretch",
+                f"expected a mesh, as by object_from_trimesh; a {self.shape} has one scale for all",
+            )
+        if not np.linalg.cond(self.stretch_matrix()) < FLATTEST:
+            fail(self, "stretch", "flattens; expected an invertible matrix")
         if self.shape == "torus" and self.minor_radius >= self.major_radius:
             fail(self, "minor_radius", f"expected less than major_radius, {self.major_radius:g}")
         _check_sides(self, self.shape)
+
+    def stretch_matrix(self) -> FloatMatrix:
+        """Return ``stretch``, (3, 3)."""
+        return np.eye(3) if self.stretch is None else np.reshape(self.stretch, (3, 3))
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Return the rotation R, (3, 3), and the position, (3,) in metres, ``seconds`` after the first frame."""

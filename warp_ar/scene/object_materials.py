@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from warp_ar.errors import SceneError, printable
-from warp_ar.scene.description import Object, Scene
-from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.description import FLATTEST, Object, Scene
+from warp_ar.scene.geometry import Mesh, make_mesh
 from warp_ar.scene.materials import (
     Color,
     EmissiveMaterial,
@@ -30,14 +30,15 @@ from warp_ar.scene.materials import (
     PhongMaterial,
 )
 from warp_ar.scene.mesh_files import load_mesh, load_moving_mesh, mesh_from_trimesh
+from warp_ar.scene.mesh_parts import MeshPart
 from warp_ar.scene.node_animation import MovingMesh
 from warp_ar.scene.textures import file_stamp, load_emission
 
 _LOG = logging.getLogger(__name__)
 _NO_FILE = (MeshMaterial(),)
 
-_NOT_SIMILAR = 1e-4
-"""Largest relative error of a similarity transform in single precision or rounded to a few digits."""
+_ROUNDED = 1e-4
+"""Largest relative error of a matrix in single precision or rounded to a few digits."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,43 +69,44 @@ def object_from_trimesh(source: Any, **fields: Any) -> Object:
 
 
 def object_at(item: Object, world_from_object: Any) -> Object:
-    """Return an object moved to the pose of a 4x4 matrix: its ``at``, ``rotate`` and ``scale`` are replaced.
+    """Return an object placed by a 4x4 matrix: its ``at``, ``rotate``, ``scale`` and ``stretch`` are replaced.
+
+    A stretch that stays the same from one call to the next is kept exactly, so that the mesh is stretched once.
 
     Args:
         item: The object.
-        world_from_object: Similarity transform, (4, 4), from the shape's coordinates to the world in metres, for column
-            vectors.
+        world_from_object: Affine transform, (4, 4), from the shape's coordinates to the world in metres, for column
+            vectors. A mesh takes any that is invertible; other shapes rotation, uniform scale and translation.
 
     Raises:
-        SceneError: The matrix is not 4x4 and finite, or is more than rotation, uniform positive scale and translation.
+        UsageError: ``item`` is no object.
+        SceneError: The matrix is not 4x4, finite, affine and invertible, or stretches a shape that is no mesh.
     """
-    from trimesh.transformations import euler_from_matrix  # imported here, because scenes from files do not need it
+    from trimesh import transformations  # scenes from files do not need it
 
     try:
-        matrix = np.asarray(world_from_object, np.float64)
+        matrix = np.array(world_from_object, np.float64)
     except (TypeError, ValueError):
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise SceneError("world_from_object: expected a 4x4 matrix of finite numbers")
-    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _NOT_SIMILAR:
+    if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _ROUNDED:
         right = "expected 0, 0, 0, 1; the translation stands in the last column"
         raise SceneError(f"world_from_object: its last row is {matrix[3].tolist()}; {right}")
-    linear = matrix[:3, :3]
-    lengths = np.linalg.norm(linear, axis=0)
-    scale = float(lengths.mean())
-    told = f"world_from_object: its axes have the lengths {np.round(lengths, 6).tolist()}"
-    if lengths.min() <= 0.0 or np.ptp(lengths) > _NOT_SIMILAR * scale:
-        raise SceneError(f"{told}; expected one positive scale for all; stretch the mesh's vertices instead")
-    turned = linear / scale
-    if np.abs(turned.T @ turned - np.eye(3)).max() > _NOT_SIMILAR:
-        raise SceneError(
-            "world_from_object: it shears; expected axes at right angles; shear the mesh's vertices instead"
-        )
-    if np.linalg.det(turned) < 0.0:
-        raise SceneError("world_from_object: it mirrors; expected a rotation; mirror the mesh's vertices instead")
-    x, y, z = map(math.degrees, euler_from_matrix(turned, "sxyz"))
-    at = (float(matrix[0, 3]), float(matrix[1, 3]), float(matrix[2, 3]))
-    return dataclasses.replace(item, at=at, rotate=(x, y, z), scale=scale)
+    matrix[3] = 0.0, 0.0, 0.0, 1.0
+    if not np.linalg.cond(matrix[:3, :3]) < FLATTEST:
+        raise SceneError(f"world_from_object: {matrix[:3, :3].tolist()} flattens; expected an invertible matrix")
+    scale = float(np.linalg.norm(matrix[:3, :3], 2))
+    matrix[:3, :3] /= scale
+    lengths, shear, *_ = transformations.decompose_matrix(matrix)
+    stretch = transformations.compose_matrix(lengths, shear)[:3, :3]
+    known = (dataclasses.replace(item, stretch=None), item)
+    same = (one.stretch for one in known if np.abs(stretch - one.stretch_matrix()).max() < _ROUNDED)
+    turned = matrix[:3, :3] @ np.linalg.inv(stretch)
+    x, y, z = map(math.degrees, transformations.euler_from_matrix(turned, "sxyz"))
+    return dataclasses.replace(
+        item, at=tuple(matrix[:3, 3]), rotate=(x, y, z), scale=scale, stretch=next(same, tuple(stretch.ravel()))
+    )
 
 
 def mesh_of(item: Object) -> Mesh | None:
@@ -115,11 +117,21 @@ def mesh_of(item: Object) -> Mesh | None:
     """
     if item.shape != "mesh":
         return None
-    if item.mesh is not None:
-        return item.mesh
-    assert item.file is not None
-    moving = moving_mesh_of(item)
-    return file_mesh(item.file) if moving is None else moving.rest
+    mesh, moving = item.mesh, moving_mesh_of(item)
+    if mesh is None:
+        assert item.file is not None
+        mesh = file_mesh(item.file) if moving is None else moving.rest
+    return mesh if item.stretch is None else stretched_mesh(mesh, item.stretch)
+
+
+@functools.lru_cache(maxsize=16)
+def stretched_mesh(mesh: Mesh, stretch: tuple[float, ...]) -> Mesh:
+    """Return a mesh whose points are mapped by an invertible matrix, given by rows; cached."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.reshape(stretch, (3, 3))
+    own = {name: getattr(mesh, name) for name in ("vertices", "faces", "normals", "tangents")}
+    moved = MeshPart(**own).moved(matrix)
+    return make_mesh(**{**vars(mesh), **{name: getattr(moved, name) for name in own}})
 
 
 def moving_mesh_of(item: Object) -> MovingMesh | None:

@@ -11,7 +11,7 @@ import re
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.scene.description import Object, Scene
+from warp_ar.scene.description import FLATTEST, Object, Scene
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.mesh_parts import LARGEST
 from warp_ar.scene.node_animation import Bend, MovingMesh
@@ -72,7 +72,7 @@ def part_placements(item: Object, moving: MovingMesh, seconds: float) -> Array:
     assert item.play is not None
     rotation, position = item.pose_at(seconds)
     own = np.eye(4)
-    own[:3, :3], own[:3, 3] = item.scale * rotation, position
+    own[:3, :3], own[:3, 3] = item.scale * rotation @ item.stretch_matrix(), position
     with np.errstate(over="ignore", invalid="ignore"):  # products of large scales overflow; see split_linear
         placed: Array = own @ moving.transforms_at(item.play.time_at(seconds, moving.duration))
     return placed
@@ -94,8 +94,6 @@ class Stretch:
 
 _RIGID = 1e-6
 """Largest relative difference of lengths that counts as single-precision rounding."""
-_FLAT = 1e-5
-"""Ratio of the shortest to the longest image of a unit vector below which a shape is too flat for rays."""
 
 
 def split_linear(linear: Array) -> Stretch:
@@ -105,7 +103,7 @@ def split_linear(linear: Array) -> Stretch:
         return nothing
     lengths = np.linalg.svd(linear, compute_uv=False)
     longest, shortest = float(lengths[0]), float(lengths[-1])
-    if not shortest > _FLAT * longest:
+    if not longest < FLATTEST * shortest:
         return nothing
     if shortest > (1.0 - _RIGID) * longest and np.linalg.det(linear) > 0.0:
         scale = float(np.cbrt(np.linalg.det(linear)))

@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_ar import scene as scenes
 from warp_ar.scene.geometry import Mesh
-from warp_ar.scene.object_materials import file_mesh
+from warp_ar.scene.object_materials import file_mesh, stretched_mesh
 from warp_ar.scene.object_shapes import ObjectShape
 from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tolerance, torus_mesh, tube_mesh
 
@@ -124,7 +124,10 @@ def mesh_key(item: ObjectShape | scenes.Object | scenes.Proxy) -> Any:
             return mesh_key(item.item)
         return item.mesh if item.bend is None else (item.index, item.mesh)  # another object deforms its own copy
     if item.shape == "mesh":
-        return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
+        if not isinstance(item, scenes.Object):
+            return item.file
+        source = item.file if item.mesh is None else item.mesh
+        return source if item.stretch is None else ("stretched", source, item.stretch)
     if not isinstance(item, scenes.Object):
         return None
     if item.shape == "torus":
@@ -145,7 +148,13 @@ def mesh_key(item: ObjectShape | scenes.Object | scenes.Proxy) -> Any:
     return None
 
 
-_MAKERS: Final[dict[str, Any]] = {"rect": rect_mesh, "disk": disk_mesh, "tube": tube_mesh, "box": box_mesh}
+_MAKERS: Final[dict[str, Any]] = {
+    "rect": rect_mesh,
+    "disk": disk_mesh,
+    "tube": tube_mesh,
+    "box": box_mesh,
+    "stretched": lambda source, stretch: stretched_mesh(make_mesh(source), stretch),
+}
 
 
 def make_mesh(key: Any) -> Mesh:
