@@ -100,7 +100,7 @@ def test_what_clips_in_one_photograph_is_raised_and_said(bracket):
     assert more.max() > 0.3
     # A texel at a saturation boundary clips in part, and is at least as bright as that part.
     assert (more <= 1.05 * more.max() * REFLECTANCE * plain.light.radiance).all()
-    assert any("what clips was raised" in note for note in raised.notes)
+    assert any("clipped light was raised" in note for note in raised.notes)
     assert not any("raised" in note for note in plain.notes)
     low = [sum(emitter.low) for emitter in raised.light.emitters]
     assert max(low) <= 1.01 * max(sum(emitter.low) for emitter in plain.light.emitters)
@@ -122,7 +122,7 @@ def test_light_too_low_for_the_table_is_raised(bracket):
     )
     told = r"the table would reflect (\d\.\d+) of this light"
     assert all(float(re.search(told, " ".join(found.notes))[1]) > 1.0 for found in (raised, plain))
-    assert any("what clips was raised" in note and "none reflects more" in note for note in raised.notes)
+    assert any("clipped light was raised" in note and "none reflects more" in note for note in raised.notes)
     assert any(note.endswith("the light is too low") for note in plain.notes)
     true, one, other = (
         irradiance_above(light).mean()
@@ -138,7 +138,7 @@ def test_a_disc_that_mirrors_nothing_is_said(tmp_path):
     cv2.circle(image, (80, 60), 25, (128, 128, 128), -1)
     write_photo(tmp_path / "a.jpg", image)
     found = capture_light([tmp_path / "a.jpg"], device="cpu")
-    assert any("the picture is flat: is a ball there" in note for note in found.notes)
+    assert any("shows no reflections: is a ball there" in note for note in found.notes)
 
 
 def test_an_exact_circle_is_taken_and_drawn_and_axes_and_rows_are_as_asked(bracket, tmp_path, capsys):
@@ -148,7 +148,7 @@ def test_an_exact_circle_is_taken_and_drawn_and_axes_and_rows_are_as_asked(brack
     assert main(arguments) == EXIT_DONE
     said = capsys.readouterr()
     assert "looking for the ball in 1 photograph" in said.err
-    assert "one photograph tells no response: srgb is taken" in said.err
+    assert "one photograph gives no response: srgb is assumed" in said.err
     photo, picture = cv2.imread(str(bracket[1])), cv2.imread(str(tmp_path / "light.outline.png"))
     rows, columns = np.nonzero((picture != photo).any(2))
     # Its ellipse, which the camera makes of a ball, is as large.

@@ -69,5 +69,5 @@ def test_a_card_that_clips_is_a_lower_bound() -> None:
 
 def test_a_frame_without_the_card_is_refused() -> None:
     away = Pose(DOWN, np.array([5.0, 0.0, 0.5]))
-    with pytest.raises(UsageError, match="nothing of its white paper"):
+    with pytest.raises(UsageError, match="does not show its white paper"):
         light_by_card(picture(0.2, 0.2, 0.2), SCENE, away)

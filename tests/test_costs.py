@@ -48,7 +48,7 @@ def test_costs_that_are_not_ours_are_measured_anew(tmp_path, text):
 def test_a_cache_that_cannot_be_written_is_no_failure(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     write_costs(tmp_path / "file", "a", KEPT)
-    assert "cannot keep measured costs" in capsys.readouterr().err
+    assert "cannot store measured costs" in capsys.readouterr().err
 
 
 def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, device: str) -> None:

@@ -158,7 +158,7 @@ def test_what_cannot_be_is_said() -> None:
         to_axes(flat, "x-up")
     with pytest.raises(UsageError, match="axes 'z-up': expected y-up, opengl for a cube"):
         to_cube(flat, "z-up")
-    with pytest.raises(UsageError, match="10 columns has no whole quarter"):
+    with pytest.raises(UsageError, match="10 columns cannot be turned"):
         to_axes(own_map(5), "opengl")
     with pytest.raises(UsageError, match="size 0"):
         to_cube(flat, "y-up", 0)

@@ -94,7 +94,7 @@ def test_every_balls_light_is_written(clip: pathlib.Path, tmp_path: pathlib.Path
     clip.write_text(clip.read_text().replace(more, ""))
     capsys.readouterr()
     assert run(clip, "--output", tmp_path / "shot.glb", "--frames", 1) == 0
-    assert "shot_environment_1.exr: of an earlier export" in capsys.readouterr().err
+    assert "shot_environment_1.exr: removed; an earlier export" in capsys.readouterr().err
     assert maps[0].exists()
     assert not maps[1].exists()
     assert theirs.exists()

@@ -218,7 +218,7 @@ def test_a_run_of_another_program_is_not_gone_on_with(tmp_path, capsys):
     run.mkdir()
     (run / "run.json").write_text(json.dumps({"version": "warp_ar 0.0", "jobs": {"clip": []}}))
     assert main(["resume", str(run)]) == 2
-    assert "was begun by warp_ar 0.0; this is warp_ar" in capsys.readouterr().err
+    assert "was started by warp_ar 0.0; this is warp_ar" in capsys.readouterr().err
 
 
 def test_the_same_on_a_local_ray_of_two_nodes(folder, finished):

@@ -400,7 +400,7 @@ def test_exposures_that_are_not_merged_are_said(tmp_path: Path, capsys: pytest.C
     (tmp_path / "frames" / "exposures.json").write_text("[0.016, 0.0159, 0.001]")
     scene = write_scene(tmp_path, source='path = "frames"')
     run(scene, "--headless", "--frames", 2)
-    assert "exposures 0.016, 0.0159 s, 1.01 times apart, count as one" in capsys.readouterr().err
+    assert "exposures 0.016, 0.0159 s, 1.01 times apart, are one" in capsys.readouterr().err
 
 
 def test_a_guessed_camera_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

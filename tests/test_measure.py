@@ -106,7 +106,7 @@ def test_what_is_turned_is_set(setting):
 def test_bad_turns_are_refused():
     with pytest.raises(UsageError, match="irradiance has no method 'sh9'; expected sphere_mip"):
         turn(PRESETS["medium"], {"irradiance": "sh9"})
-    with pytest.raises(UsageError, match="nothing called 'colour'"):
+    with pytest.raises(UsageError, match="no setting 'colour'"):
         turn(PRESETS["medium"], {"colour": "red"})
 
 

@@ -56,7 +56,7 @@ def keep_pictures(desk, count):
 def test_pictures_that_tell_too_little_are_not_written(desk, capsys, monkeypatch):
     monkeypatch.setattr(calibrate, "MOST_DEVIATION", 0.05)  # five pictures under one lamp tell 0.1
     before = (desk / "my_desk" / "scene.toml").read_text()
-    for kind, said in (("camera", "the card was tilted by"), ("response", "the curve is known to")):
+    for kind, said in (("camera", "the card was tilted by"), ("response", "the curve is known only to")):
         assert calibrate.main([kind, "pictures", "--write", "my_desk"]) == 1
         assert said in (told := capsys.readouterr().err)
         assert "nothing is written" in told
@@ -71,7 +71,7 @@ def test_a_ball_that_is_not_there_is_not_written(desk, capsys):
     assert calibrate.main(["ball", "my_desk", "--write"]) != 0
     told = capsys.readouterr().err
     assert "the camera is guessed" in told
-    assert "no mirror ball is seen" in told or "too wide to be used" in told or "the picture is flat" in told
+    assert "no mirror ball is seen" in told or "too wide to be used" in told or "shows no reflections" in told
     assert (desk / "my_desk" / "scene.toml").read_text() == before
 
 

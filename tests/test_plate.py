@@ -69,8 +69,8 @@ def test_points_in_depth_tell_pose_and_focal_length(tmp_path, capsys):
         == EXIT_DONE
     )
     said = capsys.readouterr().err
-    assert "tells no exposure" in said
-    assert "hardly known" not in said
+    assert "states no exposure" in said
+    assert "it is uncertain" not in said
     found = load_scene(scene)
     assert found.camera.fx == pytest.approx(FOCAL, rel=0.02)
     rotation = np.array(found.pose.poses[0][0]).reshape(3, 3)

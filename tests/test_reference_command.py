@@ -111,7 +111,7 @@ def test_who_interrupts_keeps_what_was_rendered(
     monkeypatch.setattr(PathTracer, "render", interrupted)
     path = tmp_path / "torus.exr"
     assert main([*QUICK, "--samples", "16", "--output", str(path)]) == EXIT_INTERRUPTED
-    assert "ended early: what is written has 8 samples a pixel" in capsys.readouterr().err
+    assert "ended early: the written picture has 8 samples a pixel" in capsys.readouterr().err
     with OpenEXR.File(str(path)) as file:
         assert file.header()["samples"] == 8
 

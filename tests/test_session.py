@@ -85,7 +85,7 @@ def test_what_cannot_be_shown_changes_nothing() -> None:
         assert session.pipeline.quality.name == "paper"
     with (
         Session(scene(), device="cpu", quality="auto", budget_ms=1e5) as session,
-        pytest.raises(UsageError, match="chooses for itself"),
+        pytest.raises(UsageError, match="chooses its methods itself"),
     ):
         session.change(quality="low")
 

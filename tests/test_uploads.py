@@ -281,8 +281,8 @@ def test_hidden_files_of_a_zip_are_left_out(tmp_path):
     ("members", "said"),
     [
         ({"other.toml": "schema = 1"}, "holds no scene.toml"),
-        ({"scene.toml": "schema = 1", "..__evil.ply": "x"}, "nothing that a scene names"),
-        ({"scene.toml": "schema = 1", "run.sh": "x"}, "run.sh is nothing"),
+        ({"scene.toml": "schema = 1", "..__evil.ply": "x"}, "no file that a scene may name"),
+        ({"scene.toml": "schema = 1", "run.sh": "x"}, "run.sh is no file"),
         ({"scene.toml": "schema = 1", "big.bin": bytes(1 << 27)}, "unpacks to 128 MB; at most 64 MB"),
         ({"scene.toml": 'schema = 1\n[camera]\nfield_of_view = 60\ntransfer = "id_rsa"'}, "no file of this name"),
         ({"scene.toml": 'schema = 1\n[camera]\nfield_of_view = 60\n[source]\npath = ".."'}, "no file of this name"),

@@ -81,7 +81,7 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
     truth = Camera(*size, 430.0, 430.0, 243.0, 176.0, (-0.12, 0.03, 0.0, 0.0))
     views = list(rendered_cards(truth, 14, seed=5, marker=SHEET))
     with Running(page_scene()) as running:
-        with pytest.raises(UsageError, match="start the calibration"):
+        with pytest.raises(UsageError, match="no calibration is running"):
             running.edit(type="calibrate", step="finish")
         with pytest.raises(UsageError, match="no camera was calibrated"):
             running.host.downloads(full_paths=False)["camera.yml"][1]()

@@ -313,7 +313,7 @@ def test_a_box_is_pointed_out_and_edited(open_tab: Callable[..., Tab], artefacts
     page.click("#proxies li:last-child .pick")
     page.wait_for_timeout(300)
     page.screenshot(path=artefacts / "pointed.png")
-    assert "as the four points have it" in page.inner_text("#notices")
+    assert "from the four points" in page.inner_text("#notices")
     assert sorted(found["size"]) == pytest.approx(sorted(truth["size"]), abs=BOX)
     assert found["at"] == pytest.approx(truth["at"], abs=BOX)
     # It is moved like anything else.

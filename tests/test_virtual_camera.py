@@ -60,7 +60,7 @@ def test_frames_go_to_the_camera(library: Any, tmp_path: Path, capsys: pytest.Ca
     assert len(camera.frames) == camera.waits == FRAMES
     assert camera.frames[0].shape == (*camera.size[::-1], 3)
     assert len(list((tmp_path / "out").glob("*.png"))) == FRAMES
-    assert "frames go to /dev/video7 (virtual camera, " in capsys.readouterr().err
+    assert "frames are sent to /dev/video7 (virtual camera, " in capsys.readouterr().err
 
 
 def test_a_camera_that_is_not_there_is_one_line(

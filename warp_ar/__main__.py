@@ -20,24 +20,24 @@ COMMANDS = {
     "init": "make a folder to start your own desk from, with the card to print",
     "live": "light a scene: the page, or --output FILE; without a scene the bundled desk",
     "calibrate": "measure camera, ball and response; print a card or marker",
-    "doctor": "say what is wrong with a set-up, and what to do",
-    "capture": "light from photographs of a mirror ball",
-    "pose": "a scene of a photograph under captured light, by points that are known in it",
+    "doctor": "find faults of a set-up, with remedies",
+    "capture": "make an environment from photographs of a mirror ball",
+    "pose": "find a photograph's camera from known points; write a scene with it and captured light",
     "environment": "write an environment for other programs",
-    "export": "write a shot for other programs",
-    "explain": "what a scene calls for, and why the rest is left out",
-    "keys": "the keys of scene files, with unit, default and example",
+    "export": "write a scene and its camera's path for other programs",
+    "explain": "list the stages that a scene needs, and why others are left out",
+    "keys": "list the keys of scene files, with unit, default and example",
     "farm": "light many recordings, make data sets",
-    "tradeoff": "what accuracy costs on this machine",
-    "paper": "the paper's figures",
-    "reference": "a path-traced picture that methods are judged by",
+    "tradeoff": "measure accuracy against cost on this machine",
+    "paper": "reproduce the paper's figures",
+    "reference": "path-trace one frame, as the reference for other methods",
 }
 """Names of the commands, each with its purpose."""
 
 
 def _run(arguments: Sequence[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        print("usage: python -m warp_ar COMMAND ...; --help after a command lists its options")
+        print("usage: python -m warp_ar COMMAND ...; COMMAND --help lists a command's options")
         for name, text in COMMANDS.items():
             print(f"  {name:12s} {text}")
         print("to start: python -m warp_ar.live, or for your own desk python -m warp_ar.init my_desk")

@@ -88,40 +88,40 @@ def make_parser() -> argparse.ArgumentParser:
 
     board = f'a board, as in a scene: "{SHEET.board}", "grid 4x3 0.04 0.01" (metres)'
     option = add("card", "write the card, or a marker or board of your own, to print at true size", "card.pdf")
-    option("--dictionary", metavar="NAME", help=f"OpenCV's dictionary of your marker (default: {Marker.dictionary})")
-    option("--id", type=FROM_0, metavar="N", help="number of your marker, instead of the card (default: 0)")
+    option("--dictionary", metavar="NAME", help=f"OpenCV dictionary of a single marker (default: {Marker.dictionary})")
+    option("--id", type=FROM_0, metavar="N", help="print this marker instead of the card (default: 0)")
     option(
         "--size",
         type=float,
         metavar="X",
-        help="side of its black square in metres, instead of the card (default: 0.08)",
+        help="side of the marker's black square, metres (default: 0.08)",
     )
     option("--board", metavar="TEXT", help=board)
     option("--paper", default="a4", metavar="|".join(PAPERS), help="size of the page (default: a4)")
     option("--dpi", type=float, default=600.0, help="dots per inch (default: 600)")
     option = add("camera", "calibrate the camera from pictures of a ChArUco board", "camera.yml")
     option("pictures", nargs="+", metavar="PATH|INDEX", help="folders, pictures, videos or a capture device")
-    option("--dictionary", metavar="NAME", help="OpenCV's dictionary (default: the pictures' board's)")
-    option("--board", metavar="TEXT", help=board + " (default: the pictures' board)")
+    option("--dictionary", metavar="NAME", help="OpenCV dictionary (default: the pictured board's)")
+    option("--board", metavar="TEXT", help=board + " (default: the pictured one)")
     text = "write camera.yml beside this scene and into its [camera]"
     option("--write", type=Path, metavar="SCENE", help=text)
     option("--frames", type=count, metavar="N", help="stop after N frames of each video or device")
     option("--fisheye", action="store_true", help="for fisheye lenses: action cameras, phones' widest")
-    option = add("ball", "measure where a scene's mirror ball stands", None)
+    option = add("ball", "measure the place and radius of a scene's mirror ball", None)
     option(
         "scene",
         metavar="SCENE",
         help="a scene with camera, marker and a rough [probe] with radius",
     )
-    option("--source", metavar="PATH|INDEX", help="frames, if not the scene's own")
-    option("--frames", type=count, default=60, metavar="N", help="frames to look at (default: 60)")
+    option("--source", metavar="PATH|INDEX", help="frames instead of the scene's own")
+    option("--frames", type=count, default=60, metavar="N", help="frames to use (default: 60)")
     option("--keep-radius", action="store_true", help="keep the scene's radius")
     option("--write", action="store_true", help="write center and radius into the scene file")
-    text = "measure the response curve by the card's greys or a still scene"
+    text = "measure the response curve from the card's greys or a still scene"
     option = add("response", text, "response.txt")
     text = "the card under several exposures or lights; with --exposures any still scene"
     option("pictures", nargs="+", metavar="PATH|INDEX", help=text)
-    text = "seconds of the pictures in turn, such as 1/200 1/50 0.08"
+    text = "exposure times of the pictures in order, seconds, such as 1/200 1/50 0.08"
     option("--exposures", nargs="+", type=seconds, metavar="S", help=text)
     option(
         "--frames",
@@ -160,14 +160,14 @@ def _run_camera(options: argparse.Namespace, target: Path | None) -> int:
     if target is not None:
         amend_scene(target, "camera", {"calibration": options.output.name}, remove=(*INTRINSICS, "field_of_view"))
         then = f"; next: python -m warp_ar.calibrate ball {options.write} --write"
-        print(f"{target}: [camera] names it now{then if load_scene(target).probes else ''}")
+        print(f"{target}: [camera] uses it now{then if load_scene(target).probes else ''}")
     return EXIT_DONE
 
 
 def _run_ball(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     if options.write and scene.path in bundled_scenes().values():
-        raise UsageError(f"--write: {options.scene} comes with the program and is not written into; copy it first")
+        raise UsageError(f"--write: {options.scene} is a bundled scene, which is not changed; copy it first")
     if not scene.probes:
         raise UsageError(f"{options.scene}: expected a [probe] with a rough center and the radius")
     spec = source_of(scene, options.source)
@@ -181,9 +181,9 @@ def _run_ball(options: argparse.Namespace) -> int:
         looked = "the only frame" if count == 1 else f"the first {count} frames"
         raise UsageError(f"{spec}: no marker in {looked}; see [marker] in {options.scene}")
     for guess in guesses(scene):
-        say(f"{guess}; until then what follows is no better than that")
+        say(f"{guess}; until then the results are no better than this guess")
     views, code = views[:: -(-len(views) // 12)], EXIT_DONE
-    say(f"looking at the ball in {len(views)} frames, which takes some seconds")
+    say(f"measuring the ball in {len(views)} frames, which takes some seconds")
     for index, probe in enumerate(scene.probes):
         others = [other for other in scene.probes if other is not probe]
         with Console(stderr=True).status("looking at the frames") as status:
@@ -200,23 +200,24 @@ def _run_ball(options: argparse.Namespace) -> int:
         print(f"probe {index}: radius = {report.radius:.5f}  {known}")
         if report.radius_deviation is None and not options.keep_radius:
             say(
-                f"probe {index}: the frames are too alike to tell the radius; it is the scene's. Move the camera around"
+                f"probe {index}: the frames are too similar to measure the radius; the scene's is kept. Move the "
+                "camera around"
             )
         flat = inside_contrast(views, camera, dataclasses.replace(probe, center=report.center)) < DULL
         if flat:
-            say(f"probe {index}: where it is, the picture is flat: is the ball there, uncovered and polished?")
+            say(f"probe {index}: its picture shows no reflections: is the ball there, uncovered and polished?")
         if flat:
             code = EXIT_FAILED
         elif not report.is_usable:
             say(
-                f"probe {index}: that is too wide to be used: have the whole ball in every frame, where [probe] has "
-                "it, and move the camera around it"
+                f"probe {index}: this interval is too wide to be used: have the whole ball in every frame, where "
+                "[probe] has it, and move the camera around it"
             )
             code = EXIT_FAILED
         elif options.write and scene.path is not None:
             center = [round(value, 5) for value in report.center]
             amend_scene(scene.path, "probe", {"center": center, "radius": round(report.radius, 5)}, index=index)
-            print(f"{scene.path}: [probe] has them now; next: python -m warp_ar.doctor {options.scene}")
+            print(f"{scene.path}: [probe] has these values now; next: python -m warp_ar.doctor {options.scene}")
     return code
 
 
@@ -228,8 +229,8 @@ def _run_response(options: argparse.Namespace, target: Path | None) -> int:
         low, high = found.span
         if target is not None and (interval := 2 * found.deviation[128].max()) > MOST_DEVIATION:
             say(
-                f"the curve is known to +/- {interval:.0%} only, by {found.views} pictures, and sRGB is as likely: "
-                "nothing is written. Take pictures of the card under exposures, or lamps, that differ more"
+                f"the curve is known only to +/- {interval:.0%} from {found.views} pictures, so it may be sRGB: "
+                "nothing is written. Take pictures of the card under exposures or lamps that differ more"
             )
             return EXIT_FAILED
         told += (
@@ -242,7 +243,7 @@ def _run_response(options: argparse.Namespace, target: Path | None) -> int:
     print(f"{options.output}: code 128 is {middle} of clipping ({told})")
     if target is not None:
         amend_scene(target, "camera", {"transfer": options.output.name})
-        print(f"{target}: [camera] names it now")
+        print(f"{target}: [camera] uses it now")
     return EXIT_DONE
 
 
@@ -253,7 +254,7 @@ def _target(options: argparse.Namespace) -> Path | None:
     path = load_scene(options.write).path
     assert path is not None
     if path in bundled_scenes().values():
-        raise UsageError(f"--write: {options.write} comes with the program and is not written into; copy it first")
+        raise UsageError(f"--write: {options.write} is a bundled scene, which is not changed; copy it first")
     options.output = path.parent / options.output.name
     return path
 

@@ -60,32 +60,32 @@ def make_parser() -> argparse.ArgumentParser:
     text = "picture of the found outline (default: beside the light)"
     add("--outline", type=ending(".png"), metavar="FILE.png", help=text)
     add("--circle", type=float, nargs=3, metavar=("X", "Y", "RADIUS"), help="exact outline of the ball, pixels")
-    text = "seconds of each photograph instead of EXIF's; pixels: by the pictures"
+    text = "exposure times, seconds, instead of EXIF's; pixels: estimate them from the pictures"
     add("--exposures", type=_exposure, nargs="+", metavar="S", help=text)
     add(
         "--shown",
         type=Path,
         metavar="PHOTO",
-        help="photograph whose camera values the light has (default: the best exposed)",
+        help="photograph in whose camera values light is written (default: the best exposed)",
     )
     text = 'response tried first, such as "gamma:2.2" (default: srgb)'
     add("--transfer", default="srgb", metavar="NAME", help=text)
     parser.add_common("--focal-35mm")
-    add("--as-clipped", action="store_true", help="do not raise what clips in a single photograph")
-    text = "the ball's reflectance (default: measured by the plane, else 0.85)"
+    add("--as-clipped", action="store_true", help="do not raise the clipped light of a single photograph")
+    text = "the ball's reflectance (default: measured from the plane, else 0.85)"
     add("--reflectance", type=number(0.01, 1.0, "a share from 0.01 to 1"), metavar="R", help=text)
-    text = "rows of the light (default: by the ball's pixels)"
+    text = "rows of the written map (default: by the ball's size)"
     add("--height", type=number(16, 4096, "16 to 4096 rows", int), metavar="N", help=text)
-    add("--axes", choices=AXES, default="z-up", help="axes of the light (default: z-up)")
+    add("--axes", choices=AXES, default="z-up", help="axes of the written map (default: z-up)")
     parser.add_common("--device")
     support = parser.add_argument_group("the plane under the ball, from the shown photograph")
     add = support.add_argument
-    text = "a rectangle's corners in order round it: column and row of each"
+    text = "columns and rows of a rectangle's corners, in order around it"
     add("--rectangle", type=pixel, nargs=8, metavar="N", help=text)
     parser.add_common("--rectangle-size", add=add)
     add("--contact", type=pixel, nargs=2, metavar=("X", "Y"), help="pixel where the ball touches the plane")
-    add("--ball-radius", type=float, metavar="M", help="the ball's radius in metres; else lengths are radii")
-    add("--scene", type=ending(".toml"), metavar="FILE.toml", help="also write a scene of it")
+    add("--ball-radius", type=float, metavar="M", help="the ball's radius in metres (default: lengths are in radii)")
+    add("--scene", type=ending(".toml"), metavar="FILE.toml", help="also write a scene of the photograph")
     return parser
 
 
@@ -100,7 +100,7 @@ def _check(options: argparse.Namespace) -> None:
     if (options.rectangle is None) != (options.rectangle_size is None):
         raise UsageError("--rectangle and --rectangle-size belong together: pixels of the corners, metres of the sides")
     if options.rectangle is not None and options.contact is not None:
-        raise UsageError("--rectangle and --contact both tell the plane; give one of the two")
+        raise UsageError("--rectangle and --contact both define the plane; give one of the two")
     if options.scene is not None and options.rectangle is None and options.contact is None:
         raise UsageError("--scene needs the plane: give --rectangle and --rectangle-size, or --contact")
     if options.ball is not None and options.circle is not None:
@@ -110,7 +110,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.exposures == [PIXELS]:
         options.exposures = PIXELS
     elif options.exposures is not None and PIXELS in options.exposures:
-        raise UsageError(f"--exposures {PIXELS} stands alone; expected no seconds beside it")
+        raise UsageError(f"--exposures {PIXELS} cannot be combined with exposure times")
     elif options.exposures is not None and len(options.exposures) != len(options.photos):
         number = counted(len(options.photos), "photograph")
         raise UsageError(f"{counted(len(options.exposures), 'exposure')} for {number}; expected one for each")

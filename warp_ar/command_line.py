@@ -80,14 +80,14 @@ _COMMON: Final[dict[str, dict[str, Any]]] = {
         "metavar": "PATH|INDEX",
         "help": "folder, picture, video, capture device or stream (rtsp://, http://)",
     },
-    "--calibration": {"metavar": "FILE|exif", "help": "OpenCV's calibration file; exif: by the first picture"},
+    "--calibration": {"metavar": "FILE|exif", "help": "OpenCV calibration file; exif: from the first picture"},
     "--light": {
         "metavar": "FILE|card",
-        "help": "captured .exr or .hdr instead of the ball's light; card: live only",
+        "help": "captured .exr or .hdr instead of the ball; card: estimate by the card (live)",
     },
     "--light-axes": {
         "choices": LATLONG_AXES,
-        "help": "axes of the light read (default: its file's, else y-up of .exr, blender of .hdr)",
+        "help": "axes of the light file (default: as it states, else y-up for .exr, blender for .hdr)",
     },
     "--device": {
         "default": "auto",
@@ -106,7 +106,7 @@ _COMMON: Final[dict[str, dict[str, Any]]] = {
     "--focal-35mm": {
         "type": number(1.0, 10_000.0, "millimetres from 1 to 10000, such as 26"),
         "metavar": "MM",
-        "help": "full-frame focal length, if EXIF does not tell",
+        "help": "35 mm equivalent focal length, if EXIF has none",
     },
 }
 """Options that have the same meaning in several commands."""

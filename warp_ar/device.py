@@ -228,7 +228,7 @@ def resolve_device(name: str = "auto") -> Any:
     known = [str(device) for device in wp.get_devices()]
     wanted = "cuda:0" if name == "cuda" else name
     if wanted not in known:
-        raise UsageError(f"device {name!r} is not here; this machine has auto, {', '.join(known)}")
+        raise UsageError(f"device {name!r} does not exist; this machine has auto, {', '.join(known)}")
     return wp.get_device(wanted)
 
 

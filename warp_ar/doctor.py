@@ -56,13 +56,13 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.doctor",
-        description="Say what is wrong with a set-up: units, camera, card, mirror ball, light, and this machine. "
-        "Ends with 1 where something is.",
+        description="Check units, camera, card, mirror ball, light and this machine; print all faults. The exit code "
+        "is 1 if there are any.",
     )
     text = "scene file, its folder, or a bundled scene's name"
     parser.add_argument("scene", metavar="SCENE", help=text)
     parser.add_common("--source")
-    text = f"frames to look at (default: {FRAMES})"
+    text = f"frames to check (default: {FRAMES})"
     parser.add_argument("--frames", type=count, default=FRAMES, metavar="N", help=text)
     text = "write [proxy.material] into the scene file if the table mirrors"
     parser.add_argument("--write", action="store_true", help=text)
@@ -141,7 +141,7 @@ def look_for_polish(scene: Scene, look: Look, tell: Callable[[str], object] | No
 
     environment = _gather_light(scene, views, tell)
     if tell is not None:
-        tell("looking whether the table mirrors its surroundings")
+        tell("checking whether the table reflects its surroundings")
     polish = estimate_polish(scene, look.camera, views, environment, look.table)
     if polish is None:
         return None
@@ -190,20 +190,20 @@ def _write_polish(scene: Scene, polish: TablePolish | None, misled: bool) -> Non
     """Write the table's measured reflection into the scene file; if nothing is written, print the reason."""
     if polish is not None and scene.path is not None:
         amend_scene(scene.path, "proxy", {"material": polish.values}, index=polish.proxy)
-        print(f"{printable(scene.path)}: its [[proxy]] has them now")
+        print(f"{printable(scene.path)}: its [[proxy]] has these values now")
     elif any(proxy.material for proxy in scene.proxies):
-        say("nothing is written: the scene has a [proxy.material]; remove it to have it told anew")
+        say("nothing is written: the scene has a [proxy.material]; remove it to have it measured again")
     elif misled:
-        say("nothing is written: with what is wrong, frames do not say how the table mirrors")
+        say("nothing is written: with the faults above, frames do not show how the table reflects")
     else:
-        say("nothing is written: the frames do not tell that the table mirrors; see polished receivers in the docs")
+        say("nothing is written: the frames show no reflections in the table; see polished receivers in the docs")
 
 
 def _run(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     bundled = scene.path in bundled_scenes().values()
     if options.write and bundled:
-        raise UsageError(f"--write: {options.scene} comes with the program and is not written into; copy it first")
+        raise UsageError(f"--write: {options.scene} is a bundled scene, which is not changed; copy it first")
     told, found = check_machine()
     source = source_of(scene, options.source)
     if source is None:
@@ -230,8 +230,8 @@ def _run(options: argparse.Namespace) -> int:
         print(f"   spoils: {finding.cost}")
         print(f"   do: {printable(finding.remedy_for(own))}")
     if found:
-        print("FLIP is the mean visible difference of the lit picture, 0 to 1, measured for the fault in brackets;")
-        print("0.01 is seen only beside the right picture, 0.05 at once")
+        print("FLIP is the mean visible difference, 0 to 1, that the fault in brackets makes in the picture;")
+        print("0.01 is visible only next to the correct picture, 0.05 at once")
     else:
         print("nothing wrong was found")
     return EXIT_FAILED if found else EXIT_DONE

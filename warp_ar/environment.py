@@ -53,10 +53,10 @@ def make_parser() -> argparse.ArgumentParser:
     add("--taken", type=_time, metavar="TIME", help="time of capture, such as 2026-05-01T12:00:00+02:00")
     text = "longitude, latitude in degrees, altitude in metres"
     add("--place", type=float, nargs=3, metavar=("EAST", "NORTH", "ALTITUDE"), help=text)
-    add("--white-luminance", type=float, metavar="CD", help="cd/m^2 of the value 1 (default: the file's)")
-    text = "acescg: to .exr only (default: rec709)"
+    add("--white-luminance", type=float, metavar="CD", help="luminance of the value 1, cd/m^2 (default: the file's)")
+    text = "primaries; acescg for .exr only (default: rec709)"
     add("--color-space", choices=tuple(COLOR_SPACES), default="rec709", help=text)
-    add("--grey-card", action="store_true", help="scale the light: a grey card on the marker has 0.18")
+    add("--grey-card", action="store_true", help="scale the light: a grey card on the marker becomes 0.18")
     parser.add_common("--overwrite")
     return parser
 

@@ -31,7 +31,7 @@ from warp_ar.stages.request import Request
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command's options."""
     parser = Parser(
-        prog="python -m warp_ar.explain", description="Say which stages a scene calls for, and why others are left out."
+        prog="python -m warp_ar.explain", description="List the stages that a scene needs, and why others are left out."
     )
     parser.add_common("scene")
     text = f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})"

@@ -108,7 +108,7 @@ def _clear_stale(output: Path, balls: int) -> None:
         number = path.stem.removeprefix(f"{output.stem}_environment_")
         if number.isdecimal() and int(number) >= balls and is_signed(path):
             path.unlink(missing_ok=True)
-            say(f"{path}: of an earlier export, of a mirror ball that this one does not have; removed")
+            say(f"{path}: removed; an earlier export wrote it for a mirror ball that this scene lacks")
 
 
 def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, tuple[Any, ...]]:
@@ -126,14 +126,14 @@ def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, tuple[Any
     ) as session:
         fps = session.source.fps
         if session.source.live:
-            raise UsageError("a camera's frames have no end to export; record them first, and name the file")
+            raise UsageError("a live camera's frames have no end; record them first, and export the file")
         for _, result in itertools.islice(session, options.frames):
             poses.append(result.pose)
             captured = (light and result.environments) or captured
         camera = session.scene.camera.scaled_to(*session.source.size)
         lit = dataclasses.replace(session.scene, camera=camera)
     if all(pose is None for pose in poses):
-        raise SourceError("no frame shows the marker, so the camera has no way; see python -m warp_ar.doctor")
+        raise SourceError("no frame shows the marker, so the camera's path is unknown; see python -m warp_ar.doctor")
     path = options.source if options.source is not None else lit.source.path if lit.source is not None else None
     plate = None if path is None else Path(os.path.relpath(path, options.output.parent))
     return Shot(lit, fps, tuple(poses), plate), captured

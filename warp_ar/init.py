@@ -64,7 +64,7 @@ def make_desk(folder: Path, source: str | int, radius: float) -> None:
     if folder.exists() or folder.is_symlink():
         raise UsageError(f"{folder}: is there already; expected the name of a new folder")
     if not folder.absolute().parent.is_dir():
-        raise UsageError(f"{folder}: no folder {folder.absolute().parent} to make it in")
+        raise UsageError(f"{folder}: its parent folder {folder.absolute().parent} does not exist")
     largest = 1.25 * max(RINGS)
     if not (math.isfinite(radius) and 0.005 <= radius <= largest):
         meant = [(unit, per * radius) for unit, per in (("cm", 1e-2), ("mm", 1e-3)) if 0.005 <= per * radius <= largest]

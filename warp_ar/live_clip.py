@@ -61,7 +61,7 @@ def reflectances_told(probes: Sequence[Probe], status: Callable[[], Mapping[str,
         if tuple(found) != tuple(round(value, 3) for value in probe.reflectance):
             said, taken = (", ".join(f"{value:.2f}" for value in values) for values in (probe.reflectance, found))
             lines.append(
-                f"mirror ball {index} was taken to reflect {taken}, as frames show it, not {said}, as [probe] has it"
+                f"mirror ball {index} reflects {taken} in the frames; this is used instead of {said} from [probe]"
             )
     return lines
 
@@ -188,7 +188,7 @@ class _Clip:
             offset = [round(1e3 * (b - a), 2) for a, b in zip(before.center, after.center, strict=True)]
             good = fit is not None and fit.is_good
             found.append({"offset_mm": offset, "deviation_mm": round(1e3 * fit.deviation, 2) if fit and good else None})
-            left = "left where the scene has it: too little of the desk shows in it"
+            left = "kept at the scene's place: it shows too little of the desk"
             say(f"mirror ball {index} {f'moved by {offset} mm' if good else left}")
         return {"balls": found} if found else {}
 
@@ -232,7 +232,7 @@ class _Clip:
         source, size = self.session.source, self.session.pipeline.size
         # Frames of a clip are shown at its rate, frames of a live camera as they come.
         camera = VirtualCameraSink(device or None, fps=source.fps, size=size, paced=not source.live)
-        say(f"frames go to {camera.description}")
+        say(f"frames are sent to {camera.description}")
         return camera
 
     # ---------------------------------------------------------------------------------------------------------- frames
@@ -309,7 +309,7 @@ class _Clip:
             "border is in view, sharp and not mirrored"
         )
         if log.count == MARKER_PATIENCE:
-            message += "; where it comes later, cut off what is before"
+            message += "; if it appears later, cut off the frames before it"
         if not live:
             raise RunError(message)
         say(message)
@@ -330,7 +330,7 @@ class _Clip:
         if reads_ball and self.views and not generated:
             camera = scene.camera.scaled_to(*self.session.source.size)
             if not ball_is_seen(scene, camera, self.views):
-                raise RunError(f"{NO_BALL}, so its light is not that of the desk; {see}")
+                raise RunError(f"{NO_BALL}, so the light does not fit the desk; {see}")
         if self.log.count > 0 and not self.changed and (scene.objects or scene.lights):
             raise RunError(
                 "no frame was changed: no [[object]] and no [[light]] reaches the picture; check their at, in metres"
@@ -382,9 +382,9 @@ class _Clip:
 def _choice(status: Mapping[str, Any]) -> str:
     """Return the settings that a budget has chosen, in words."""
     if "settings" not in status:
-        return f"{AUTO}: no marker was seen, so nothing was chosen"
+        return f"{AUTO}: no marker was seen, so no methods were chosen"
     if not status["changes"]:
-        return f"{AUTO}: too few frames to choose by"
+        return f"{AUTO}: too few frames to choose methods"
     chosen = ", ".join(f"{setting} {method}" for setting, method in status["settings"].items())
     return (
         f"{AUTO}: {chosen}; {status['expected_ms']:.1f} of {status['budget_ms']:g} ms, expected error "

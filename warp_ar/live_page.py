@@ -44,7 +44,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
     if options.refine_ball:
         raise UsageError("--refine-ball needs --headless or --output; before the page, run warp_ar.calibrate ball")
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
-        raise UsageError("--token: expected letters and digits, for it stands in an address")
+        raise UsageError("--token: expected letters and digits, as it is part of an address")
     light = None if options.light == "card" else options.light
     if options.calibration is None and light is None:
         return load_scene(options.scene)
@@ -100,11 +100,11 @@ def _say_no_camera(options: argparse.Namespace, text: str) -> None:
     """Print how to connect a camera other than this machine's; the page goes on."""
     from warp_ar.viewer.address import LOOPBACK
 
-    say(f'{text}; the page goes on without: press "My camera" there for the camera of the browser\'s machine')
+    say(f'{text}; the page runs without it: press "My camera" there for the camera of the browser\'s machine')
     if options.host in LOOPBACK:
         say(f"for a phone's camera: python -m warp_ar.live {printable(options.scene)} --host 0.0.0.0 --tls")
     elif not options.tls:
-        say("browsers keep their camera from other machines without TLS: start with --tls as well")
+        say("browsers allow their cameras to pages of other machines only over TLS: start with --tls too")
 
 
 def serve_page(options: argparse.Namespace) -> int:

@@ -31,7 +31,7 @@ def say_quick_check(options: argparse.Namespace, scene: Scene) -> tuple[bool, st
     found = [finding for finding in findings if not finding.name.startswith(told)]
     worst = [finding for finding in found if finding.name not in ALWAYS][:1]
     for finding in [*worst, *(finding for finding in found if finding.name in ALWAYS)]:
-        more = f"; all there is to say: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
+        more = f"; all findings: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
         own = None if scene.path in bundled_scenes().values() else options.scene
         say(f"{finding.text}; to do: {finding.remedy_for(own)}{more}")
     return ball_seen, next((finding.text for finding in [*worst, *found]), "")

@@ -45,7 +45,7 @@ PAGE = "figures.md"
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command's options."""
-    parser = Parser(prog="python -m warp_ar.paper", description="Make the paper's figures again, beside ours.")
+    parser = Parser(prog="python -m warp_ar.paper", description="Reproduce the paper's figures, beside ours.")
     add = parser.add_argument
     names = ", ".join(map(str, FIGURES))
     add("figures", nargs="*", metavar="FIGURE", help=f"{names} or {READINGS} (default: all)")

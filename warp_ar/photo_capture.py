@@ -147,7 +147,7 @@ def capture_light(
             "one (--circle)"
         )
     if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
-        notes.append("where the ball is found, the picture is flat: is a ball there, uncovered and polished?")
+        notes.append("the ball's picture shows no reflections: is a ball there, uncovered and polished?")
     found = None if support is None else support(outline, camera)
     turn = np.array(pose_of_position((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0]).reshape(3, 3)
     if found is not None:
@@ -177,18 +177,18 @@ def _ball_reflectance(table: Table | None, given: float | None) -> tuple[RGB, st
     told = None if table is None else table.reflectance_of_ball()
     if told is None and given is None:
         how = "give --reflectance" + ", --contact or --rectangle" * (table is None)
-        return (GUESS,) * 3, f"the ball is taken to reflect {GUESS:g} of its light; all light is off by as much: {how}"
+        return (GUESS,) * 3, f"the ball is assumed to reflect {GUESS:g} of its light, which scales all light: {how}"
     looks = ""
     if told is not None:
         middle = float(np.mean(told.reflectance))
         low, high = (middle * math.exp(sign * 2.0 * told.deviation) for sign in (-1.0, 1.0))
-        seen = f"{middle:.2f} ({low:.2f} to {min(high, 1.0):.2f}) of its light, by the table that it mirrors"
+        seen = f"{middle:.2f} ({low:.2f} to {min(high, 1.0):.2f}) of its light, from the table's reflection"
         if given is None:
             red, green, blue = (min(value, 1.0) for value in told.reflectance)
             return (red, green, blue), f"the ball reflects {seen}"
         looks = "" if low <= given <= high else f"; it looks like {seen}"
     assert given is not None
-    return (given,) * 3, f"the ball reflects {given:g}, as was given{looks}"
+    return (given,) * 3, f"the ball reflects {given:g}, as given{looks}"
 
 
 def _best_exposed(photos: Sequence[Photograph]) -> int:
@@ -215,7 +215,7 @@ def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tu
         return camera, []
     told = info.focal_35mm is not None or info.focal_pixels is not None
     why = "was cut, so that EXIF's focal length says nothing" if told else "has no focal length in its EXIF"
-    note = f"{photo.name} {why}: the ball is taken to be far away (--focal-35mm tells otherwise)"
+    note = f"{photo.name} {why}: the ball is assumed to be far away (correct it by --focal-35mm)"
     return dataclasses.replace(far_camera(width, height), transfer=transfer), [note]
 
 
@@ -287,7 +287,7 @@ def _merge_plan(
     """Return the photographs to merge, each with its ball's place and its exposure."""
     circle = (*outline.center, outline.radius)
     if len(photos) == 1:
-        note = f"one photograph tells no response: {transfer} is taken; by a phone's, darks may be 3 times darker"
+        note = f"one photograph gives no response: {transfer} is assumed; with a phone's, darks may be 3 times darker"
         return _Bracket((reference,), (circle,), (1.0,), None, (note,))
     claims: dict[str, Sequence[float] | None] = {"given": None, "exif": None, "names": None}
     if not isinstance(given, str):
@@ -302,7 +302,7 @@ def _merge_plan(
     rough = [_same_place(circle, reference.image, photo.image) for photo in chosen]
     aligned = align([photo.image for photo in chosen], rough, times, chosen.index(reference))
     notes = [f"{photo.name} is left out: {why}" for photo, why in zip(chosen, aligned.strangers, strict=True) if why]
-    notes += [f"{photo.name} tells no exposure, so none is taken from EXIF" for photo in untold]
+    notes += [f"{photo.name} has no exposure in EXIF, so EXIF is not used" for photo in untold]
     notes += _shift_notes(chosen, aligned, rough, outline.radius)
     stay = [k for k, why in enumerate(aligned.strangers) if not why]
     picked = {name: None if claim is None else [claim[order[k]] for k in stay] for name, claim in claims.items()}
@@ -413,8 +413,8 @@ def _make_light(maps: _Maps, bracket: _Bracket, table: Table | None, raises: boo
     more = whole / max(float((maps.radiance * area).sum()), 1e-12) - 1.0
     if more > LEAST_SAID:
         notes.append(
-            f"what clips was raised, which makes {more:.0%} more light: nearly every place has as much; a shorter "
-            "photograph beside this one measures it (--as-clipped leaves it out)"
+            f"clipped light was raised to a typical value, which makes {more:.0%} more light: most places have as "
+            "much; an additional, shorter photograph measures it (--as-clipped leaves it out)"
         )
     if table is not None:
         radiance, said = _bounded(radiance, clipped, table, raises)
@@ -433,10 +433,10 @@ def _bounded(radiance: Map, clipped: Map, table: Table, raises: bool) -> tuple[M
     if not raises:
         return radiance, [f"{note}: the light is too low"]
     if bounds < LEAST_CLIPPED * whole.mean():
-        return lacking * radiance, [f"{note}: all light was raised {lacking:.2f} times; what does --reflectance say?"]
+        return lacking * radiance, [f"{note}: all light was raised {lacking:.2f} times; is --reflectance right?"]
     grow = float((lacking - 1.0) * whole.mean() / bounds)
     raised = np.asarray(radiance * (1.0 + grow * clipped), np.float32)
-    return raised, [f"{note}: what clips was raised {1.0 + grow:.2f} times"]
+    return raised, [f"{note}: clipped light was raised {1.0 + grow:.2f} times"]
 
 
 def _raised(radiance: Map, confidence: Map, clipped: Map) -> Map:

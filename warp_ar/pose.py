@@ -32,18 +32,18 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.pose",
-        description="Find where a photograph's camera stood, by a rectangle or known points; write a scene with two "
-        "balls, lit by what capture wrote.",
+        description="Find a photograph's camera from a rectangle or known points; write a scene with two balls in "
+        "light that capture wrote.",
     )
     add = parser.add_argument
     add("plate", type=Path, metavar="PLATE", help="photograph to put objects into")
     add("--light", type=Path, required=True, metavar="FILE", help="captured light, such as light.exr")
     add("--scene", type=ending(".toml"), default=Path("plate.toml"), metavar="FILE.toml", help="default: plate.toml")
     parser.add_common("--overwrite")
-    text = "corners of a rectangle, as for capture; the same one turns the light to the plate"
+    text = "corners of a rectangle, the same as for capture, so that light fits"
     add("--rectangle", type=pixel, nargs=8, metavar="N", help=text)
     parser.add_common("--rectangle-size")
-    text = "a known point, metres, z up, and its pixel; four or more"
+    text = "a known point (metres, z up) and its pixel; four or more"
     shown = ("X", "Y", "Z", "COLUMN", "ROW")
     add("--point", type=number(-1e9, 1e9, "metres or pixels"), nargs=5, action="append", metavar=shown, help=text)
     parser.add_common("--focal-35mm")
@@ -81,13 +81,13 @@ def find_camera(plate: Photograph, options: argparse.Namespace) -> tuple[Camera,
         camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         if options.focal_35mm is None:
             camera, least, most = focal_range(camera, find)
-            doubt = "; it is hardly known: give --focal-35mm, or points in depth" * (most > HARDLY_KNOWN * least)
+            doubt = "; it is uncertain: give --focal-35mm, or points in depth" * (most > HARDLY_KNOWN * least)
             say(
                 f"the focal length is {camera.fx / unit:.0f} mm (35 mm; {least / unit:.0f} to {most / unit:.0f}){doubt}"
             )
     support = find(camera)
     x, y, z = support.pose.inverse().translation
-    say(f"the camera is at ({x:.3f}, {y:.3f}, {z:.3f}) m; what was picked misses by {support.error:.1f} pixels")
+    say(f"the camera is at ({x:.3f}, {y:.3f}, {z:.3f}) m; the given points are off by {support.error:.1f} pixels")
     return camera, support
 
 
@@ -99,7 +99,7 @@ def place(options: argparse.Namespace) -> int:
     scale = 1.0
     if light.exposure is None or plate.info.exposure is None:
         whose = options.light if light.exposure is None else options.plate
-        say(f"{whose} tells no exposure: the light is taken to be of the plate's; [light] scale says otherwise")
+        say(f"{whose} states no exposure: the plate's is assumed for the light; [light] scale corrects it")
     else:
         scale = plate.info.exposure / light.exposure
         say(f"the plate has {scale:.3g} times the light's exposure")

@@ -45,12 +45,12 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.reference",
-        description="Path-trace one frame in the light that the pipeline finds, with standard errors.",
+        description="Path-trace one frame with the light that the pipeline estimates, with standard errors.",
     )
     add = parser.add_argument
     parser.add_common("scene", "--source", "--light", "--light-axes", "--calibration", "--device", "--overwrite")
-    add("--frame", type=FROM_0, default=0, metavar="N", help="which frame, from 0; earlier ones bring the light")
-    text = f"mean paths per pixel, at most (default: {DEFAULT_SAMPLES})"
+    add("--frame", type=FROM_0, default=0, metavar="N", help="the frame's number, from 0; earlier frames add light")
+    text = f"largest mean number of paths per pixel (default: {DEFAULT_SAMPLES})"
     add("--samples", type=count, default=DEFAULT_SAMPLES, metavar="N", help=text)
     text = "relative standard error to stop at, such as 0.01"
     add("--error", type=number(LEAST, 1e9, "a number above 0, such as 0.01"), metavar="E", help=text)
@@ -58,9 +58,9 @@ def make_parser() -> argparse.ArgumentParser:
     add("--output", type=ending(".png", ".exr"), metavar="FILE", help=text)
     text = "write the pipeline's picture, the reference and their difference"
     add("--compare", type=ending(".png"), metavar="FILE.png", help=text)
-    text = "preset that finds the light (default: high)"
+    text = "preset that estimates the light (default: high)"
     add("--quality", default="high", metavar="NAME", help=text)
-    text = "find in the frame how far the light file's emitters stand"
+    text = "estimate from the frame the distances of the light file's emitters"
     add("--places", action="store_true", help=text)
     text = "write the light, with distances of --places, for live --light"
     add("--save-light", type=ending(".exr"), metavar="FILE.exr", help=text)
@@ -96,7 +96,7 @@ def trace(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         if pictures and writes:
             _write_all(options, known, pictures[-1])
-            say(f"ended early: what is written has {pictures[-1].samples} samples a pixel")
+            say(f"ended early: the written picture has {pictures[-1].samples} samples a pixel")
         raise
     picture = pictures[-1]
     _write_all(options, known, picture)
@@ -118,7 +118,7 @@ def places_found(light: Light) -> str:
         for emitter in light.emitters
         if emitter.distance is not None
     ]
-    return f"emitters: {'; '.join(found)}" if found else "emitters: the frame tells of none how far it stands"
+    return f"emitters: {'; '.join(found)}" if found else "emitters: the frame shows the distance of none"
 
 
 def _write_all(options: argparse.Namespace, known: KnownFrame, picture: TracedPicture) -> None:

@@ -232,7 +232,7 @@ class Session(Closing):
             SceneError: As for ``Pipeline.change``.
         """
         if not isinstance(self.pipeline, Pipeline):
-            raise UsageError(f"a session of quality {AUTO!r} chooses for itself; open another one")
+            raise UsageError(f"a session of quality {AUTO!r} chooses its methods itself; open another session")
         self.pipeline.change(scene, quality=quality)
 
     def warm_up(self, progress: Progress | None = None) -> None:

@@ -41,21 +41,21 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.tradeoff",
-        description="Measure what accuracy costs: errors and milliseconds of every method.",
+        description="Measure accuracy and cost: errors and milliseconds of every method.",
     )
     add = parser.add_argument
-    text = "scenes, or all: the bundled ones (default: desk, or --truth)"
+    text = "scenes; all: all bundled ones (default: desk, or --truth's)"
     add("scenes", nargs="*", metavar="SCENE", help=text)
     add("--stage", metavar="NAME", help="change only this setting, such as recover")
     add("--presets", action="store_true", help="run whole presets only, into presets.json")
-    add("--only", type=_words, metavar="A,B", help=f"with --presets: these instead of {','.join(RUNS)}")
+    add("--only", type=_words, metavar="A,B", help=f"with --presets: presets to run (default: {','.join(RUNS)})")
     add("--truth", type=Path, metavar="DIR", help="a case with true pictures, or a folder of cases")
     text = f"versions of the cases (default: {','.join(VERSIONS)})"
     add("--versions", type=_words, default=list(VERSIONS), metavar="A,B", help=text)
     add("--frames", type=count, default=DEFAULT_FRAMES, metavar="N", help=f"frames per run (default: {DEFAULT_FRAMES})")
     parser.add_common("--shrink", "--device")
     add("--quick", action="store_true", help="without brute force: minutes instead of hours")
-    add("--processor-time", action="store_true", help="on CPU count all threads' work, not clock time")
+    add("--processor-time", action="store_true", help="on CPU measure all threads' processor time, not clock time")
     text = "folder of tradeoff.jsonl, cost_table.json, tradeoff.html (or presets.json)"
     add("--out", type=Path, metavar="DIR", help=text)
     parser.add_common("--overwrite")
@@ -75,7 +75,7 @@ def check(options: argparse.Namespace) -> None:
     if options.presets and options.stage is not None:
         raise UsageError(f"--presets --stage {options.stage}: expected one of both")
     if options.only is not None and not options.presets:
-        raise UsageError(f"--only {','.join(options.only)}: expected --presets beside it")
+        raise UsageError(f"--only {','.join(options.only)}: needs --presets")
     for name in options.only or ():
         if name not in PRESETS:
             raise UsageError(f"--only {name}: expected presets of {', '.join(PRESETS)}, separated by commas")
@@ -109,9 +109,9 @@ def asked_cases(options: argparse.Namespace, console: Console) -> list[tuple[Cas
         if settings or (options.presets and not case.name.endswith(SIZED)):
             asked.append((case, settings))
         else:
-            console.print(f"{case.name}: nothing to turn", highlight=False)
+            console.print(f"{case.name}: no setting to vary", highlight=False)
     if not asked:
-        raise UsageError("nothing to turn in any scene that was named")
+        raise UsageError("no scene has a setting to vary")
     return asked
 
 
@@ -124,7 +124,7 @@ def tradeoff(options: argparse.Namespace) -> int:
     check(options)
     device = resolve_device(options.device)
     if options.processor_time and not device.is_cpu:
-        raise UsageError(f"--processor-time counts a processor's work; it says nothing of {device}")
+        raise UsageError(f"--processor-time measures the CPU's time; it does not apply to {device}")
     clock = time.process_time if options.processor_time else None
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
@@ -132,7 +132,9 @@ def tradeoff(options: argparse.Namespace) -> int:
     out = None if options.out is None else OwnFiles(options.out, names, overwrite=options.overwrite)
     asked = asked_cases(options, console)
     if options.frames < SETTLED:
-        console.print(f"after {options.frames} frames the light has not settled: --frames {SETTLED} or more tells more")
+        console.print(
+            f"after {options.frames} frames the light has not settled: better give --frames {SETTLED} or more"
+        )
     reports = []
     with Progress(console=console) as progress:
         task = progress.add_task("", total=sum(len(settings) + (2 if settings else 1) for _, settings in asked))

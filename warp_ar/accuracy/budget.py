@@ -85,7 +85,7 @@ class AutoPipeline(Closing):
             SceneError: The scene's camera does not fit ``size``.
         """
         if not budget_ms > 0.0:
-            raise UsageError(f"a budget of {budget_ms} ms is none; expected a number above 0")
+            raise UsageError(f"budget {budget_ms} ms: expected a number above 0")
         self.budget_ms = budget_ms
         self._given, self._folder, self._clock = scene, folder or cache_folder(), clock
         self._errors = load_errors()
@@ -151,7 +151,7 @@ class AutoPipeline(Closing):
             key = cost_key(self.plan, self.device, self.settings)
             self._costs = read_costs(self._folder, key, self.settings)
             if self._costs is None:
-                say("measuring what each method costs here; this is done once")
+                say("measuring the cost of each method on this machine; this is done once")
                 shown = image.numpy() if isinstance(image, wp.array) else image
                 self._costs = measure_costs(self._given, shown, pose, str(self.device), self.size, self.settings)
                 write_costs(self._folder, key, self._costs)
@@ -205,7 +205,7 @@ class AutoPipeline(Closing):
         controller = self._controller
         if controller is not None and not controller.fits and not self._told:
             self._told = True
-            least = f"{controller.measured_ms:.3g} ms at least, by the cheapest methods, which are used"
+            least = f"the cheapest methods, which are used, take {controller.measured_ms:.3g} ms"
             say(f"{self.budget_ms:g} ms cannot be kept: {least}")
 
     def status(self) -> dict[str, Any]:

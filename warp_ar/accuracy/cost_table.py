@@ -117,7 +117,7 @@ def turn(quality: Quality, settings: Mapping[str, str]) -> Quality:
     methods: dict[str, str] = {}
     for name, method in settings.items():
         if name not in known:
-            raise UsageError(f"there is nothing called {name!r} to turn; expected {', '.join(known)}")
+            raise UsageError(f"there is no setting {name!r}; expected {', '.join(known)}")
         if method not in known[name].methods:
             raise UsageError(f"{name} has no method {method!r}; expected {', '.join(known[name].methods)}")
         if name in NUMBERS:
@@ -221,7 +221,7 @@ def read_errors(cost_table: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     """
     listed = cost_table.get("errors")
     if not isinstance(listed, Mapping):
-        raise UsageError(f"{COST_TABLE}: expected a table 'errors'; make it anew with python -m warp_ar.tradeoff")
+        raise UsageError(f"{COST_TABLE}: expected a table 'errors'; write it again with python -m warp_ar.tradeoff")
     errors: dict[str, dict[str, float]] = {}
     for setting in SETTINGS:
         own, last = listed.get(setting.name, {}), 0.0

@@ -254,4 +254,4 @@ def write_costs(folder: Path, key: str, costs: Costs) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, json.dumps(everything, indent=1).encode())
     except OSError as error:
-        say(f"cannot keep measured costs in {folder}: {error.strerror}")
+        say(f"cannot store measured costs in {folder}: {error.strerror}")

@@ -137,9 +137,9 @@ def light_up_to(
                 continue
             where = f"frame {number} of {frames.description}"
             if not result.shown:
-                raise SourceError(f"{where} has another exposure than the frames that are shown; name one of those")
+                raise SourceError(f"{where} has another exposure than the shown frames; choose one of those")
             if result.pose is None:
-                raise SourceError(f"{where} shows no marker, so where objects stand is not known; name another frame")
+                raise SourceError(f"{where} shows no marker, so objects' places are unknown; choose another frame")
             return known_frame(pipeline, frame.image, result, frame.time - first)
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
 

@@ -69,7 +69,7 @@ def reflectance_scatter(tracer: PathTracer) -> float:
             total += float(np.log1p(((logarithm - np.median(logarithm)) / GRAIN) ** 2).sum())
             count += len(values)
     if not count:
-        raise UsageError("the frame shows no proxy by which emitters could be placed")
+        raise UsageError("the frame shows no proxy, which is needed to place emitters")
     return total / count
 
 

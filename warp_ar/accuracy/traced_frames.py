@@ -34,7 +34,7 @@ class TracedFrames:
             UsageError: The pipeline adapts its quality to a budget.
         """
         if not isinstance(self.pipeline, Pipeline):
-            raise UsageError("--samples with --quality auto: name a preset, whose light is used")
+            raise UsageError("--samples needs a preset as --quality, which estimates the light; auto is none")
 
     def __call__(self, frame: Any, result: Any) -> Image:
         """Return the traced picture of a frame; the pipeline's if the marker is lost or the exposure is not shown."""

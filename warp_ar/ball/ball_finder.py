@@ -335,7 +335,7 @@ def _window(image: Image, camera: Camera, sphere: Array) -> tuple[Image, Camera,
 def _describe(camera: Camera, sphere: Array, spread: Array, support: float) -> BallOutline:
     points, _ = silhouette(camera, sphere)
     if len(points) == 0:
-        raise UsageError("the ball's outline does not fit a ball before the camera; give a rough circle")
+        raise UsageError("the outline fits no ball in front of the camera; give a rough circle")
     (x, y), (a, b), angle = cv2.fitEllipseDirect(points.astype(np.float32)[:, None])
     if a < b:
         a, b, angle = b, a, angle + 90.0
@@ -411,7 +411,7 @@ def _sphere_of_given(image: Image, camera: Camera, rough: Sequence[float]) -> Ar
         raise UsageError(f"ball {x:g}, {y:g}, {reach:g}: the circle lies outside the picture, {width}x{height} pixels")
     start = sphere_of_circle(camera, *rough)
     if start[2] <= 1.0:
-        raise UsageError("no ball is before the camera at this circle; expected one that is nearer to the axis")
+        raise UsageError("no ball in front of the camera has this circle; expected one nearer to the picture's centre")
     return start
 
 

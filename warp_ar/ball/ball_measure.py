@@ -97,22 +97,23 @@ def measure_ball(
     solution = solve_ball(outlines, camera, probe, ground)
     if abs(solution.radius - probe.radius) > STRAY * probe.radius:
         raise UsageError(
-            f"what is round where the ball should be has a radius of {solution.radius:.3f} m, but [probe] radius = "
-            f"{probe.radius:g}: a ring on the card, or a wrong radius; stand the ball on the cross, and measure it"
+            f"the round outline at the ball's place has a radius of {solution.radius:.3f} m, but [probe] radius = "
+            f"{probe.radius:g}: it is a ring on the card, or the radius is wrong; stand the ball on the cross, and "
+            "measure it"
         )
     assumed = keep_radius or solution.radius_assumed
     radius = probe.radius if assumed else solution.radius
     deviation = ASSUMED * radius if assumed else solution.radius_deviation
     own, how = max(solution.center_deviation), f"by {len(outlines)} outlines"
     if not assumed and ground is not None and _is_doubtful(solution, probe, len(few)):
-        tell("its radius, by what it mirrors")
+        tell("the ball's radius, from its reflections")
         mirrored = mirrored_radius(few, camera, probe, proxies, others)
         if mirrored is not None and _contradicts(solution, mirrored):
             radius, deviation = mirrored.radius, DEVIATION * mirrored.radius
             own = SLOPE * deviation
             solution = dataclasses.replace(solution, center=mirrored.center)
             how = "by the desk in it"
-    tell("its place, by what it mirrors")
+    tell("the ball's place, from its reflections")
     told = None if assumed else deviation
     by_outlines = BallMeasurement(solution.center, own, radius, told, how)
     found = dataclasses.replace(probe, center=solution.center, radius=radius)

@@ -107,7 +107,7 @@ def _check_ball(
         text = f"{label}: {clipped:.0%} of the ball clips; walls should not"
         found.append(Finding("ball.clipped", text, "set a shorter exposure, or [source] exposures"))
     if contrast < DULL:
-        text = f"{label}: the ball mirrors nothing ({contrast:.0%} contrast inside it): painted, dusty or dull"
+        text = f"{label}: the ball shows no reflections ({contrast:.0%} contrast inside it): painted, dusty or dull"
         found.append(Finding("ball.dull", text, "wipe it, or use a polished ball"))
     support = float(np.median([outline.support for outline, _ in outlines]))
     if support < SEEN:
@@ -135,8 +135,8 @@ def _check_reflectance(
         return []
     red, green, blue = np.minimum(found, 1.0)
     text = (
-        f"{label} reflectance = {float(np.mean(probe.reflectance)):.2g}: what stands beside the ball is "
-        f"{float(found.mean()):.2f} times as bright mirrored in it as seen directly"
+        f"{label} reflectance = {float(np.mean(probe.reflectance)):.2g}: surfaces next to the ball are "
+        f"{float(found.mean()):.2f} times as bright in its reflection as seen directly"
     )
     remedy = f"write reflectance = [{red:.2f}, {green:.2f}, {blue:.2f}], or wipe the ball"
     return [Finding("ball.reflectance", text, remedy)]
@@ -148,7 +148,7 @@ def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> 
         off = solution.radius - probe.radius
         if abs(off) > max(RADIUS * probe.radius, 3 * solution.radius_deviation):
             text = (
-                f"{label} radius = {probe.radius:g}: outline and card together say {solution.radius:.4f} "
+                f"{label} radius = {probe.radius:g}: outline and card together give {solution.radius:.4f} "
                 f"+/- {2 * solution.radius_deviation:.4f} m"
             )
             remedy = f"measure ball, card and the print's rulers; {command}"
@@ -188,7 +188,7 @@ def _why_lost(
     """Return the finding on a missing ball: it is elsewhere, is painted, or is absent."""
     command = "check center and radius, and that nothing hides the ball"
     if contrast < 0.5 * DULL:
-        text = f"{label}: where the ball should be, the picture is flat: painted over, covered or not there"
+        text = f"{label}: the picture of the ball shows no reflections: it is painted, covered or not there"
         return Finding("ball.unfound", text, command)
     text = f"{label}: no ball is seen where the scene has it"
     with contextlib.suppress(UsageError):

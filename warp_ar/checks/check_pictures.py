@@ -173,7 +173,7 @@ def _check_card(marker: Marker, look: Look) -> Iterator[Finding]:
         yield Finding("marker.small", text, "move the camera nearer, or print a larger card")
     worst = float(np.median(look.errors))
     if worst > WORST_EDGES:
-        text = f"the print's edges are {worst:.1f} pixels from where the camera's numbers have them"
+        text = f"the print's edges are {worst:.1f} pixels from their places by the camera's numbers"
         remedy = "lay the card flat, check [marker], and run python -m warp_ar.calibrate camera PICTURES"
         yield Finding("camera.edges", text, remedy)
     yield from _check_focal(marker, look)
@@ -191,8 +191,8 @@ def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
         if not counts or counts.most_common(1)[0][1] < 2:
             return None
     wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
-    text = f"{wanted} is in the picture twice, and either may be followed"
-    return Finding("marker.twice", text, "cover or take away the one that the scene does not mean")
+    text = f"{wanted} is in the picture twice, so that tracking may confuse them"
+    return Finding("marker.twice", text, "cover or remove one of them")
 
 
 def _marker_side(marker: Marker, camera: Camera, pose: Pose) -> float:
@@ -228,7 +228,7 @@ def why_unseen(marker: Marker, look: Look) -> Finding:
     if seen:
         numbers = ", ".join(str(n) for n in sorted({d.id for d in seen})[:6])
         text = f"no {wanted} in {len(look.images)} frames; the picture shows {name} {numbers}"
-        return Finding("marker.other", text, "print the card that [marker] names, or write what is printed")
+        return Finding("marker.other", text, "print the card of [marker], or write the printed one into [marker]")
     whole = "the whole card with its white margin" if marker.board else "the whole black square with its white margin"
     text = f"no {wanted} in {len(look.images)} frames; {whole} must be in the picture"
     return Finding("marker.unseen", text, "show all of it, flat, sharp and lit; check [marker]")
@@ -387,7 +387,7 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
     if not whites:
         return
     if np.median(clipped) > CLIPPED_SHARE:
-        text = f"{np.median(clipped):.0%} of the card's white clips, so that it tells nothing of the light"
+        text = f"{np.median(clipped):.0%} of the card's white clips, so that it does not show the light"
         yield Finding("card.clipped", text, "set a shorter exposure on the camera")
     if np.median(dark) < DARK:
         text = f"the card's white is dark: {np.median(dark):.1%} of clipping"
@@ -406,7 +406,7 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
         text = (
             f"a shadow lies across the card: its white differs by a factor of {math.exp(float(np.median(uneven))):.1f}"
         )
-        yield Finding("card.shadow", text, "move what shades the card, or the card")
+        yield Finding("card.shadow", text, "move the object that shades the card, or the card")
     yield from _check_drift(look, views, np.array(whites))
 
 
@@ -427,7 +427,7 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
     spread = float(np.percentile(ratio.mean(1), 80) - np.percentile(ratio.mean(1), 20))
     if abs(change) > DRIFT and abs(levels[-1] - levels[0]) > DRIFT and spread < 0.5 * abs(change):
         text = f"the exposure drifts: all of the picture changes by a factor of {math.exp(change):.2f}"
-        yield Finding("camera.drift", text, 'lock the camera\'s exposure, or say [source] metering = "automatic"')
+        yield Finding("camera.drift", text, 'lock the camera\'s exposure, or write [source] metering = "automatic"')
     colour = ratio[:, [0, 2]] - ratio[:, 1:2]
     shift, width = np.median(colour, axis=0), np.percentile(colour, 80, axis=0) - np.percentile(colour, 20, axis=0)
     k = int(np.argmax(np.abs(shift)))
@@ -484,8 +484,8 @@ def check_saturation(scene: Scene, look: Look) -> list[Finding]:
     level = round(float(np.median(told)))
     if max(float((image[::2, ::2] > level + ALIKE_ENDS).mean()) for image, _ in look.views) > FEW:
         return []
-    text = f"what clips in the ball ends at code {level} of 255"
-    remedy = "turn the camera's HDR and tone mapping modes off, so that what clips has code 255"
+    text = f"clipped light in the ball has code {level} of 255"
+    remedy = "turn the camera's HDR and tone mapping modes off, so that clipped light has code 255"
     if _lowest_code(look.images) >= LIMITED[0] and level <= LIMITED[1]:
         text += " and nothing is black: limited range (16 to 235) shown as if it were full"
         remedy = "set the camera, the capture card or the recording to full range (0 to 255)"

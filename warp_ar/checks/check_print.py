@@ -85,7 +85,7 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
     right = factor * told
     lengths = f"{made.square_length * right:.5f} {made.marker_length * right:.5f}"
     name = "A4" if paper == "a4" else "Letter"
-    text = f"the card is printed at {right:.1%}, by its {name} paper; [marker] says {told:.1%}"
+    text = f"the card is printed at {right:.1%}, measured from its {name} paper; [marker] has {told:.1%}"
     remedy = (
         f"measure its rulers, which should be {100 * right:.1f} mm, and write [marker] board = "
         f'"charuco {made.columns}x{made.rows} {lengths}"; or print it at 100 %'

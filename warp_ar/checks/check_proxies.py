@@ -58,10 +58,10 @@ def check_proxies(scene: Scene, camera: Camera, views: Sequence[tuple[Image, Pos
         off = np.median(worse, axis=0)
         x, y = np.add(proxy.at[:2], off)
         text = (
-            f"[[proxy]] {index}: few edges of the picture lie on the outline of the {proxy.shape}; it has them "
+            f"[[proxy]] {index}: few edges of the picture lie on the outline of the {proxy.shape}; most lie "
             f"{1e3 * math.hypot(*off):.0f} mm away"
         )
-        remedy = f"point it out anew in the page, or write at = [{x:.3f}, {y:.3f}, {proxy.at[2]:g}]"
+        remedy = f"point it out again on the page, or write at = [{x:.3f}, {y:.3f}, {proxy.at[2]:g}]"
         found.append(Finding("proxy.edges", text, remedy))
     return found
 

@@ -32,7 +32,7 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.farm",
-        description="Light many recordings, or make a data set of them, with several workers; resume after any death.",
+        description="Light many recordings, or make data sets of them, with several workers. Runs can be resumed.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="run|status|resume|plan")
 
@@ -42,22 +42,22 @@ def make_parser() -> argparse.ArgumentParser:
     run = add("run", "begin a run")
     run.add_argument("jobs", type=Path, metavar="JOBS.toml", help="the job file")
     run.add_argument("--output", type=Path, required=True, metavar="DIR", help="the run's new folder")
-    resume = add("resume", "go on with a run")
+    resume = add("resume", "continue a run")
     resume.add_argument("folder", type=Path, metavar="DIR", help="the run's folder")
-    resume.add_argument("--failed", action="store_true", help="try failed jobs again")
+    resume.add_argument("--failed", action="store_true", help="repeat failed jobs")
     for command in (run, resume):
-        text = "workers here (default: one per 4 cores, on GPUs one per 2)"
+        text = "number of workers (default: one per 4 cores, with GPUs one per 2)"
         command.add_argument("--workers", type=WORKERS, metavar="N", help=text)
-        text = "workers of a Ray cluster (default: one started here)"
+        text = "use a Ray cluster's workers (default: a new cluster here)"
         command.add_argument("--ray", nargs="?", const="", metavar="ADDRESS", help=text)
-    plan = add("plan", "count jobs, try three, say what all would take")
+    plan = add("plan", "count the jobs, time three, estimate the time of all")
     plan.add_argument("jobs", type=Path, metavar="JOBS.toml", help="the job file")
     plan.add_argument("--workers", type=WORKERS, metavar="N", help="workers to plan for")
     for command in (run, resume, plan):
         command.add_common("--device")
-    status = add("status", "say where a run stands")
+    status = add("status", "print the progress of a run")
     status.add_argument("folder", type=Path, metavar="DIR", help="the run's folder")
-    status.add_argument("--json", action="store_true", help="as JSON")
+    status.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
 
@@ -95,8 +95,8 @@ def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], 
     mine = program_version()
     if version != mine:
         raise UsageError(
-            f"{folder} was begun by {version}; this is {mine}: install that version, or begin a new run, for "
-            "pictures of two programs are not of one kind"
+            f"{folder} was started by {version}; this is {mine}: install that version, or start a new run, as pictures "
+            "of two versions may differ"
         )
     jobs = parse_jobs(data, str(folder / "run.json"))
     with locked(folder):

@@ -86,7 +86,7 @@ class VideoPart(VideoFile):
             try:
                 container.seek(start, stream=container.streams.video[0], backward=True)
             except (av.FFmpegError, OSError) as error:
-                raise SourceError(f"{self._path}: frame {self._first} cannot be gone to: {reason(error)}") from error
+                raise SourceError(f"{self._path}: frame {self._first} cannot be reached: {reason(error)}") from error
             number = self._first
             for image, stamp, plate in self._pictures(container, start):
                 expected = float(ticks[number] * tick)

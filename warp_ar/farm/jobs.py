@@ -241,8 +241,9 @@ def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None
     whole = settings.light == "preroll" and settings.segment_frames is None
     if scene.source is not None and scene.source.metering == "automatic" and not whole:
         raise JobsError(
-            f'{label}: clip {clip.name}: scene {clip.scene} says source.metering = "automatic", and its drift is told '
-            'from all frames before; expected run.light = "preroll" without segment_frames, or metering = "fixed"'
+            f'{label}: clip {clip.name}: scene {clip.scene} says source.metering = "automatic", whose drift is '
+            'measured from all earlier frames; expected run.light = "preroll" without segment_frames, or metering = '
+            '"fixed"'
         )
     cut = settings.segment_frames is not None and settings.light != "preroll"
     if scene.exposure.scale == "auto" and jobs.dataset is None and cut:

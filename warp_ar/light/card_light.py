@@ -115,7 +115,7 @@ def light_by_card(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> Car
     """
     shown = _look(image, scene, pose)
     if not (shown.group == 0).any():
-        raise UsageError("light by the card: the frame shows nothing of its white paper; expected the marker in sight")
+        raise UsageError("light by the card: the frame does not show its white paper; show the whole card")
     with one_blas_thread():
         found = [_solve(shown, scene.marker.white, channel) for channel in range(3)]
     radiance = np.stack([values for values, _ in found], -1).reshape(ROWS, 2 * ROWS, 3)

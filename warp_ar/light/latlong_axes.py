@@ -114,7 +114,7 @@ def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error
     if picture.header.get("software") == PROGRAM:
         return "z-up"
     taken, whose = ("blender", "as Blender reads .hdr") if path.suffix.lower() == ".hdr" else ("y-up", "OpenEXR's own")
-    say_once(f"{label} does not say its axes: {taken} is taken, {whose}; --light-axes or [light] axes say another")
+    say_once(f"{label} does not state its axes: {taken} is assumed, {whose}; else give --light-axes or [light] axes")
     return taken
 
 
@@ -127,5 +127,5 @@ def _quarter(radiance: Radiance, axes: str) -> int:
         return 0
     width = int(radiance.shape[1])
     if width % 4:
-        raise UsageError(f"a latlong of {width} columns has no whole quarter; axes {axes} need a width divisible by 4")
+        raise UsageError(f"a latlong of {width} columns cannot be turned to axes {axes}; expected a multiple of 4")
     return -width // 4 if axes == "y-up" else width // 4

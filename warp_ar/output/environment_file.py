@@ -140,7 +140,7 @@ def write_environment(
     check_replaceable(path, overwrite=overwrite)
     suffix = path.suffix.lower()
     if color_space != "rec709" and suffix in (".hdr", ".json"):
-        raise UsageError(f"{path}: color space {color_space!r} is told in OpenEXR alone; name an .exr")
+        raise UsageError(f"{path}: color space {color_space!r} can be stored in OpenEXR only; name an .exr")
     radiance = convert_light(radiance, "rec709", color_space)
     described = (DESCRIPTIONS if layout == "latlong" else CUBES)[axes]
     data: Any
@@ -288,5 +288,5 @@ def grey_card_scale(radiance: Radiance) -> float:
     luminance = radiance.astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
     irradiance = float((luminance * cos_theta).sum())
     if not irradiance > 0.0 or not math.isfinite(irradiance):
-        raise UsageError(f"--grey-card: the light from above is {irradiance:g}; there is nothing to scale by")
+        raise UsageError(f"--grey-card: the light from above is {irradiance:g}, so it cannot be scaled")
     return math.pi / irradiance

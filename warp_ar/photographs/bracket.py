@@ -95,7 +95,7 @@ class Aligned:
 def _stranger(alike: float, changed: float) -> str:
     if alike < MOVED and not changed <= RELIT:
         return f"it shows something else ({alike:.0%} alike)"
-    return f"its light is another, by {math.expm1(changed):.0%} from place to place" if changed > RELIT else ""
+    return f"its light differs, by {math.expm1(changed):.0%} from place to place" if changed > RELIT else ""
 
 
 def cut_ball(image: Image, circle: Circle, size: int) -> Image:
@@ -444,7 +444,7 @@ def agree_exposures(
     if not steps:
         if len(pixels) < len(seen.steps):
             raise UsageError(
-                "neither EXIF nor names are left to tell the exposures, and too few pixels do; give --exposures"
+                "neither EXIF nor names give the exposures, and too few pixels can be compared; give --exposures"
             )
         note = f"exposures are from the pixels alone, with the response {transfer}: {figures} times"
         return Exposures(tuple(np.cumprod([1.0, *seen.steps]).tolist()), None, (note,))

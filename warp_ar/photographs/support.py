@@ -65,7 +65,7 @@ def plane_from_points(camera: Camera, points: Sequence[Sequence[float]], pixels:
     matrix, bent = camera.matrix(), np.array(camera.distortion)
     found, turn, translation = cv2.solvePnP(world, seen, matrix, bent, flags=cv2.SOLVEPNP_SQPNP)
     if not found:
-        raise UsageError("no camera sees these points at these pixels; is one of them another?")
+        raise UsageError("no camera sees these points at these pixels; is one of them mistaken?")
     turn, translation = cv2.solvePnPRefineLM(world, seen, matrix, bent, turn, translation)
     off = cv2.projectPoints(world, turn, translation, matrix, bent)[0][:, 0] - seen
     pose = Pose(cv2.Rodrigues(turn)[0], translation.ravel())
@@ -134,7 +134,7 @@ def plane_from_rectangle(
     """
     points = np.array(corners, float)
     if points.shape != (4, 2) or not np.isfinite(points).all() or min(size) <= 0.0:
-        raise UsageError(f"rectangle {corners}: expected four pixels round it, and two lengths above 0")
+        raise UsageError(f"rectangle {corners}: expected four pixels in order around it, and two lengths above 0")
     w, h = size
     corners_3d = np.array([[-w, -h, 0.0], [w, -h, 0.0], [w, h, 0.0], [-w, h, 0.0]]) / 2
     # In the other order, the picture would show the rectangle's underside, with y toward the camera.
@@ -163,7 +163,7 @@ def _solve(camera: Camera, corners: Array, points: Array) -> tuple[Pose, float]:
         rotation, translation = cv2.Rodrigues(rotations[k])[0], translations[k].ravel()
         if translation[2] > 0 and (rotation.T @ -translation)[2] > 0:
             return Pose(rotation, translation), float(np.array(errors).ravel()[k])
-    raise UsageError("rectangle: no plane before the camera is seen like that; pick its corners in order round it")
+    raise UsageError("rectangle: no plane in front of the camera looks like that; give its corners in order around it")
 
 
 def plane_from_contact(

@@ -216,7 +216,7 @@ def rational_of_fisheye(
     factor = (1.0 + powers @ found[:3]) / (1.0 + powers @ found[3:])
     off = float(np.abs(factor * radius - turned).max()) * max(matrix[0, 0], matrix[1, 1])
     if not off < FISHEYE_ERROR:
-        raise SceneError(f"the fisheye's model is met within {off:.2f} pixels only; expected {FISHEYE_ERROR:g}")
+        raise SceneError(f"the fisheye's model is approximated only to {off:.2f} pixels; expected {FISHEYE_ERROR:g}")
     k1, k2, k3, k4, k5, k6 = map(float, found)
     return k1, k2, 0.0, 0.0, k3, k4, k5, k6
 

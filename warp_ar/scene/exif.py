@@ -107,7 +107,7 @@ class PhotoInfo:
             return ""
         return (
             f"EXIF contradicts itself: focal length {pixels:.0f} pixels by the sensor's resolution, {film:.0f} by the "
-            "35 mm equivalent, which is taken"
+            "35 mm equivalent, which is used"
         )
 
     def camera(self, transfer: str | Path = "srgb") -> Camera | None:
@@ -180,7 +180,7 @@ def camera_by_exif(path: Path, transfer: str | Path = "srgb") -> Camera:
         print(f"{path}: {info.contradiction}", file=sys.stderr)
     camera = info.camera(transfer)
     if camera is None:
-        why = "tells no focal length" if info.is_whole else f"is of {info.width}x{info.height}, a part of a photograph"
+        why = "has no focal length" if info.is_whole else f"is of {info.width}x{info.height}, a part of a photograph"
         raise SceneError(f"{path}: its EXIF {why}; calibrate the camera or give its numbers")
     return camera
 

@@ -155,6 +155,4 @@ def check_linear(transfer: str) -> None:
         UsageError: The transfer is another one.
     """
     if transfer != "srgb":
-        raise UsageError(
-            f'camera.transfer = "{transfer}": frames of linear light are encoded as srgb; take the key out'
-        )
+        raise UsageError(f'camera.transfer = "{transfer}": frames of linear light are encoded as srgb; remove the key')

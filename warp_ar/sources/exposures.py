@@ -75,7 +75,7 @@ def plan_bracket(exposures: Sequence[float], shown: float | None = None) -> Brac
         note = f"exposures drift from {longest:g} to {min(exposures):g} s instead of alternating: no bracket"
         return BracketPlan((), shown or longest, notes=(note,))
     notes = [
-        f"exposures {', '.join(f'{time:g}' for time in group)} s, {group[0] / group[-1]:.2f} times apart, count as one"
+        f"exposures {', '.join(f'{time:g}' for time in group)} s, {group[0] / group[-1]:.2f} times apart, are one"
         for group in groups
         if len(group) > 1
     ]

@@ -562,4 +562,4 @@ def tell_missing_poses(spec: PoseSpec | None, source: Source) -> str:
         return ""
     first = Path(frames[missing[0]]).name or f"frame {missing[0]}"
     are = "1 frame has" if len(missing) == 1 else f"{len(missing)} of {len(frames)} frames have"
-    return f"{spec.file}: {are} no pose there, {first} first; nothing virtual is shown in them"
+    return f"{spec.file}: {are} no pose there, {first} first; no virtual objects are shown in them"

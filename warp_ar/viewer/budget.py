@@ -119,7 +119,7 @@ class BudgetSetting:
             self._adopt(end.value)
         except Exception as error:
             self._failed = key  # otherwise the next frame would start the same measurement again
-            self._notify(failure(error, "what methods cost stays unknown"))
+            self._notify(failure(error, "the costs of methods stay unknown"))
         finally:
             self._progress = progress
         self._notify(self.record())

@@ -240,13 +240,13 @@ class Host:
         """Add a proxy for the part of the desk that four points of the newest frame outline, pixels."""
         lit = self.latest
         if lit is None or lit.pose is None:
-            raise UsageError("the marker is not seen, so no point of the picture has a place: show it first")
+            raise UsageError("the marker is not seen, so points of the picture cannot be located: show it first")
         proxy = point_out(lit.camera, lit.pose, kind, points)
         self._controls.change(
             lambda w: dataclasses.replace(w, scene=edits.add_item(w.scene, "proxy", proxy)), f"point out a {kind}"
         )
         sides = " x ".join(f"{1e3 * side:.0f}" for side in proxy.size)
-        text = f"{kind.capitalize()} of {sides} mm: as the four points have it; its numbers and handles edit it."
+        text = f"{kind.capitalize()} of {sides} mm: from the four points; edit it by its numbers and handles."
         self._notify(notice(text))
 
     def _open_scene(self, name: str) -> None:

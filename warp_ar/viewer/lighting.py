@@ -153,7 +153,7 @@ class Lighting:
                 self._first = None  # the wanted quality itself may still work
             else:
                 self._first, self._settled = None, True
-                self._notify(failure(error, "what was shown before stays"))
+                self._notify(failure(error, "the state before stays"))
                 self.take_back()
         if self._main.swaps != before:
             assert self._main.pipeline is not None

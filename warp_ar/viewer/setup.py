@@ -257,7 +257,7 @@ class SetupChecks:
             UsageError: Another step is running.
         """
         if self._step is not None:
-            raise UsageError("the frames are being looked at already: wait until that is done")
+            raise UsageError("a check or measurement is running: wait until it is done")
         self._step, self._waits = step, True
         self._steps[step].failed = ""
         self._notify(self.message())
@@ -303,13 +303,13 @@ class SetupChecks:
         if not scene.probes:
             raise UsageError("the scene has no mirror ball: use the printed card, or add one to its file")
         if len(look.views) < FEWEST:
-            raise UsageError("the marker was seen in too few frames to measure the ball by")
+            raise UsageError("the marker was seen in too few frames to measure the ball")
         probe, *others = scene.probes
         found = measure_ball(look.views, look.camera, probe, scene.proxies, others, tell=self._tell)
         if not found.is_usable:
             raise UsageError(
-                f"the ball is known to {2e3 * found.deviation:.0f} mm only: nothing is changed. Have all of it in the "
-                "picture, look at it from the side rather than from above, and move the camera around it"
+                f"the ball's place is known only to {2e3 * found.deviation:.0f} mm: nothing is changed. Have all of it "
+                "in the picture, look at it from the side rather than from above, and move the camera around it"
             )
         x, y, z = (round(value, 5) for value in found.center)
         ball = dataclasses.replace(probe, center=(x, y, z), radius=round(found.radius, 5))
@@ -320,7 +320,7 @@ class SetupChecks:
 
         self._controls.change(change, "measure the ball")
         moved = 1e3 * math.dist(found.center, probe.center)
-        unsure = " as typed (the views are too alike to tell it: move the camera around)"
+        unsure = " as typed (the views are too similar to measure it: move the camera around)"
         radius = unsure if found.radius_deviation is None else f" ± {2e3 * found.radius_deviation:.1f} mm"
         return (
             f"The ball's centre was {moved:.1f} mm off; it is known to ± {2e3 * found.deviation:.1f} mm now. "
@@ -347,15 +347,15 @@ class SetupChecks:
         interval = 2 * found.deviation[128].max()
         if interval > MOST_DEVIATION:
             raise UsageError(
-                f"the curve is known to {interval:.0%} only, by {found.views} pictures, and sRGB is as likely: nothing "
-                "is changed. Show the card under exposures, or lamps, that differ more"
+                f"the curve is known only to {interval:.0%} from {found.views} pictures, so it may be sRGB: nothing "
+                "is changed. Show the card under exposures or lamps that differ more"
             )
         write_response(found.curve, self._path)
         camera = dataclasses.replace(scene.camera, transfer=self._path)
         self._controls.change(lambda w: w.with_camera(camera), "measure the response")
         return (
             f"Code 128 is {found.curve[128].mean():.3f} of clipping ± {interval:.0%} (sRGB: 0.216), by "
-            f"{found.views} pictures. Several exposures, or lamps on and off, tell it better."
+            f"{found.views} pictures. Several exposures, or lamps on and off, measure it better."
         )
 
     def response_file(self) -> bytes:
@@ -452,7 +452,7 @@ class CalibrationSession:
         if step == "finish":
             seen = self._views  # read once, as another viewer may finish or stop meanwhile
             if seen is None:
-                raise UsageError("nothing was looked at yet: start the calibration first")
+                raise UsageError("no calibration is running: start one first")
             report = seen.solve()
             if report.doubt:
                 # The views are kept, so that more can be added.

@@ -116,7 +116,7 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
             raise UsageError(f"{name}: {_shown(inside)} ... has {len(inside)} characters; {limits}")
         plain = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", inside) and ".." not in parts.parts
         if not plain or (inside != SCENE and parts.suffix.lower() not in _KINDS):
-            raise UsageError(f"{name}: {_shown(inside)} is nothing that a scene names")
+            raise UsageError(f"{name}: {_shown(inside)} is no file that a scene may name")
     folders = {str(folder) for inside in names for folder in PurePosixPath(inside).parents}
     if both := folders.intersection(names):
         raise UsageError(f"{name}: {_shown(min(both))} is a file and a folder")
@@ -246,7 +246,7 @@ def _mesh_edit(name: str, path: Path, wanted: Wanted) -> Edit:
     low, high = np.asarray(mesh.bounds, float)
     longest = float((high - low).max())
     if not longest > 0.0:
-        raise SceneError(f"{name}: all of it is at one point")
+        raise SceneError(f"{name}: all its vertices are at one point")
     # Files are usually in metres, or in millimetres if meant for 3D printers; otherwise units are unknown.
     scale = next((unit for unit in (1.0, 0.001) if SIZES[0] <= longest * unit <= SIZES[1]), USUAL / longest)
     middle = (low + high) / 2
@@ -270,7 +270,7 @@ def _light_edit(name: str, path: Path) -> Edit:
     light = Light.load(path)
     captured = CapturedLight(path)
     height, width = light.radiance.shape[:2]
-    words = f"{name}: light of {width}x{height} directions stands for what the mirror ball shows. Undo takes it back."
+    words = f"{name}: its light ({width}x{height} texels) replaces the mirror ball's. Undo restores that."
     return (
         lambda w: dataclasses.replace(w, scene=dataclasses.replace(w.scene, captured=captured)),
         f"light by {name}",

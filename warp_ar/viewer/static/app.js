@@ -31,7 +31,7 @@ let carded = 0;
 
 let run = null;
 connection.addEventListener("hello", ({ detail }) => {
-  if (run !== null && run !== detail.run && !$("undo").disabled) notice("The program was started anew: edits that were made before are gone.", true);
+  if (run !== null && run !== detail.run && !$("undo").disabled) notice("The program was restarted: earlier edits are lost.", true);
   run = detail.run;
   $("scene-name").replaceChildren(...detail.scenes.map((name) => new Option(name, name)));
   const group = document.createElement("optgroup");
@@ -57,7 +57,7 @@ const adopt = (next) => {
   $("hint").hidden = !first || !!localStorage.getItem("warp_ar.dragged");
   if (first) $("hint").textContent = `The ${(first.file ?? first.shape).replace(/\.\w+$/, "").replaceAll("_", " ")} is not real. Drag it.`;
   $("captured-note").hidden = !scene.captured;
-  $("captured-note").textContent = scene.captured ? `Light of ${scene.captured} stands for what the mirror ball shows.` : "";
+  $("captured-note").textContent = scene.captured ? `The light of ${scene.captured} replaces the mirror ball's.` : "";
 };
 let waiting = null;
 // A scene from before this page's last edit would take that edit back on the screen, and the next key or drag would begin there.
@@ -106,7 +106,7 @@ connection.addEventListener("state", ({ detail }) => {
   showBuilding();
   $("use-clip").setAttribute("aria-pressed", String(!state.camera));
   $("use-camera").setAttribute("aria-pressed", String(state.camera));
-  $("fps").title = `Shown per second here; the program lights ${state.fps.toFixed(1)} a second for ${state.watchers} viewer${state.watchers === 1 ? "" : "s"}`;
+  $("fps").title = `Frames shown per second; the program lights ${state.fps.toFixed(1)} a second for ${state.watchers} viewer${state.watchers === 1 ? "" : "s"}`;
   showCamera();
   showBall(state.ball);
 });
@@ -138,11 +138,11 @@ connection.addEventListener("calibration", ({ detail }) => {
   const lines = [];
   const fields = covered.flat();
   const [enough, next] = views >= wanted
-    ? ["enough", "Press “Use what was seen”, or go on: fields that are not green yet make the lens better known."]
+    ? ["enough", "Press “Use what was seen”, or continue: each further green field makes the result more accurate."]
     : [`${wanted - views} more are good`, "Show the printed card from another side each time, tilted and in all parts of the picture: fields that it reached turn green."];
   if (on) lines.push(`${views} view${views === 1 ? "" : "s"} so far, ${enough}; ${fields.filter(Boolean).length} of ${fields.length} fields reached. ${next}`);
   else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${(2 * report.deviation).toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Undo takes it back. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
-  else lines.push("Print the card, lay it flat and show it to the camera from a dozen sides: light and shadow then sit where they belong.");
+  else lines.push("Print the card, lay it flat and show it to the camera from a dozen sides: then objects and shadows are in the right places.");
   $("calibration-note").textContent = lines.join(" ");
 });
 

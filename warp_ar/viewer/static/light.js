@@ -23,7 +23,7 @@ export class Light {
 
   async take(message) {
     this.#note.textContent = message.known
-      ? "Linear light, brought into range: what clips in the camera still shows. Left: as a mirror ball in the camera's view. Right: every direction, up at the top, the marker's right in the middle."
+      ? "Linear light, tone-mapped so that clipped light is visible. Left: as a mirror ball in the camera's view. Right: all directions, up at the top, the marker's right in the middle."
       : "Not captured: no stage of this scene reads it, or the marker has not been seen.";
     if (!message.known) {
       this.#map = null;

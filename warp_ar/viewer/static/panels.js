@@ -382,7 +382,7 @@ export class TimePanel {
       row.classList.toggle("skipped", rests);
       bar.style.width = ms === undefined || rests ? "0" : `${Math.max(1, (100 * ms) / longest)}%`;
       time.textContent = rests ? "skipped" : ms === undefined ? "" : ms.toFixed(ms < 10 ? 2 : 1);
-      const text = rests ? "Skipped: nothing that it reads has changed." : `${summary[0].toUpperCase()}${summary.slice(1)}.`;
+      const text = rests ? "Skipped: its inputs have not changed." : `${summary[0].toUpperCase()}${summary.slice(1)}.`;
       if (why.firstChild.textContent !== text) {
         why.firstChild.textContent = text;
         row.title = text;
@@ -570,11 +570,11 @@ export class QualityPanel {
     const { measuring, remaining } = this.#budget ?? {};
     if (typeof measuring === "number") {
       const left = remaining === null || remaining === undefined ? "" : `, about ${duration(remaining)} left`;
-      return `Measuring what each method costs on this device, once: ${Math.round(100 * measuring)} %${left}. The picture is slower meanwhile.`;
+      return `Measuring the cost of each method on this device, once: ${Math.round(100 * measuring)} %${left}. The picture is slower meanwhile.`;
     }
-    if (!bought) return "The program then chooses the methods that err least within this time. What each costs on this device is measured once; how long that takes is told as soon as it is known.";
+    if (!bought) return "The program then chooses the methods with the smallest error within this time. Their costs on this device are measured once; the remaining time is shown as soon as it is known.";
     const { choice, took, fits } = bought;
-    if (this.#budget.choices.every((one) => one.error === 0)) return "What these methods err is not in the cost table, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
+    if (this.#budget.choices.every((one) => one.error === 0)) return "The errors of these methods are not in the cost table, so the cheapest are used: python -m warp_ar.tradeoff makes a table.";
     const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, with an error of ${error(choice.error)} against the truth.`];
     if (!fits) parts.push("Nothing cheaper is left.");
     return parts.join(" ");

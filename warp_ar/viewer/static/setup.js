@@ -83,7 +83,7 @@ export class SetupPanel {
     const words = missing
       ? `${sentence(missing.text)} ${remedy(missing)}`
       : seen === "tracked"
-        ? "The marker is seen. Go on with the camera."
+        ? "The marker is seen. Continue with the camera."
         : seen
           ? `The marker is not seen: ${what}, with the white around it, must be in the picture, flat, sharp and lit.`
           : camera
@@ -104,10 +104,10 @@ export class SetupPanel {
     const put_step = (step, id, idle) =>
       put(id, busy === step ? (doing ? `Looking at the frames: ${doing} …` : LOOKING) : failed[step] ? sentence(failed[step]) : measured[step] ?? idle);
     const count = findings?.length ?? 0;
-    put_step("ball", "ball-note", "Centre and radius are solved for together, from the frames of the last seconds: move the camera around the ball, then press.");
-    put_step("light", "light-by-card", "Without a ball: what the card, planes and boxes of the newest frame show of the light; later changes are not followed.");
-    put_step("response", "response-note", "How the camera encodes light, told by the card's grey patches under different exposures or light.");
-    put_step("check", "check-note", findings ? (count ? `${count} finding${count === 1 ? "" : "s"}, the worst first:` : "Nothing wrong was found.") : outdated ? "The set-up has changed since it was looked at: check it again." : "Units, card, camera, ball and light are looked at in the frames of the last seconds.");
+    put_step("ball", "ball-note", "Centre and radius are measured together, from the frames of the last seconds: move the camera around the ball, then press.");
+    put_step("light", "light-by-card", "Without a ball: the light is estimated from card, planes and boxes in the newest frame; later changes are not followed.");
+    put_step("response", "response-note", "The camera's response curve, measured from the card's grey patches under different exposures or lights.");
+    put_step("check", "check-note", findings ? (count ? `${count} finding${count === 1 ? "" : "s"}, the worst first:` : "Nothing wrong was found.") : outdated ? "The set-up has changed since the last check: check it again." : "Units, card, camera, ball and light are checked in the frames of the last seconds.");
     $("response-file").hidden = !measured.response;
     $("findings").replaceChildren(...(findings ?? []).map((one) => el("li", {}, sentence(one.text), el("small", {}, `Spoils: ${one.cost}.`), el("small", {}, `To do: ${remedy(one)}`))));
     if (busy === null) return void (this.#busy = null);
