@@ -33,23 +33,24 @@ def cell_place(pixel: wp.int32, stride: wp.int32, size: wp.int32) -> wp.float32:
     return wp.float32(low) + wp.min(wp.float32(pixel - here) / wp.float32(there - here), 1.0)
 
 
+@wp.struct
+class SurfaceCells:
+    """Values of cells, and the surface on which each cell lies."""
+
+    values: wp.array2d[wp.vec3]
+    surface: wp.array2d[wp.int32]  # ``surface_key`` of the cell; -1: none, and its value is not valid
+    stride: wp.int32  # pixels along a cell
+
+
 @wp.func
-def look_up_cells(
-    values: wp.array2d[wp.vec3],
-    surface: wp.array2d[wp.int32],
-    stride: wp.int32,
-    key: wp.int32,
-    size: wp.vec2i,
-    row: wp.int32,
-    col: wp.int32,
-) -> wp.vec4:
+def look_up_cells(cells: SurfaceCells, key: wp.int32, size: wp.vec2i, row: wp.int32, col: wp.int32) -> wp.vec4:
     """Interpolate cells to a pixel bilinearly, among the cells of the pixel's surface alone.
 
     Return (RGB, 1), or zero if none of the four cells around the pixel lies on its surface ``key``. If only cells of
     zero bilinear weight do, the result is their mean. ``size`` holds the rows and columns of the frame.
     """
-    y = cell_place(row, stride, size[0])
-    x = cell_place(col, stride, size[1])
+    y = cell_place(row, cells.stride, size[0])
+    x = cell_place(col, cells.stride, size[1])
     i0 = wp.int32(y)
     j0 = wp.int32(x)
     total = wp.vec3()
@@ -58,15 +59,15 @@ def look_up_cells(
     count = float(0.0)
     for a in range(2):
         for b in range(2):
-            i = wp.min(i0 + a, values.shape[0] - 1)
-            j = wp.min(j0 + b, values.shape[1] - 1)
-            if surface[i, j] == key:
+            i = wp.min(i0 + a, cells.values.shape[0] - 1)
+            j = wp.min(j0 + b, cells.values.shape[1] - 1)
+            if cells.surface[i, j] == key:
                 weight = (1.0 - wp.abs(y - wp.float32(i0 + a))) * (1.0 - wp.abs(x - wp.float32(j0 + b)))
                 if weight > 0.0:
-                    total += weight * values[i, j]
+                    total += weight * cells.values[i, j]
                     weights += weight
                 else:
-                    beside += values[i, j]
+                    beside += cells.values[i, j]
                     count += 1.0
     if weights <= 0.0:
         if count <= 0.0:
@@ -78,22 +79,15 @@ def look_up_cells(
 
 
 @wp.func
-def any_cell_above_zero(
-    values: wp.array2d[wp.vec3],
-    surface: wp.array2d[wp.int32],
-    stride: wp.int32,
-    size: wp.vec2i,
-    row: wp.int32,
-    col: wp.int32,
-) -> wp.bool:
+def any_cell_above_zero(cells: SurfaceCells, size: wp.vec2i, row: wp.int32, col: wp.int32) -> wp.bool:
     """Return whether any cell that ``look_up_cells`` may read for a pixel holds more than zero."""
-    i0 = wp.int32(cell_place(row, stride, size[0]))
-    j0 = wp.int32(cell_place(col, stride, size[1]))
+    i0 = wp.int32(cell_place(row, cells.stride, size[0]))
+    j0 = wp.int32(cell_place(col, cells.stride, size[1]))
     for a in range(2):
         for b in range(2):
-            i = wp.min(i0 + a, values.shape[0] - 1)
-            j = wp.min(j0 + b, values.shape[1] - 1)
-            if surface[i, j] >= 0 and wp.max(values[i, j]) > 0.0:
+            i = wp.min(i0 + a, cells.values.shape[0] - 1)
+            j = wp.min(j0 + b, cells.values.shape[1] - 1)
+            if cells.surface[i, j] >= 0 and wp.max(cells.values[i, j]) > 0.0:
                 return True
     return False
 

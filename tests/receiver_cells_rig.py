@@ -8,6 +8,7 @@ import warp as wp
 from tests.kernel_rig import constant_environment, records, shape, tables, trace_of
 from tests.reference import receiver_cells as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, point
+from warp_ar.kernels.cells import SurfaceCells
 from warp_ar.kernels.receiver import receiver_cells, relight
 from warp_ar.kernels.receiver.receiver import ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.receiver.receiver_cells import Patch
@@ -22,6 +23,7 @@ from warp_ar.kernels.structs import (
     Probe,
     RayScene,
     Shape,
+    filled,
     make_picture,
 )
 
@@ -124,8 +126,7 @@ class View:
     def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False):
         share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
-        written = ReceiverCells()
-        written.ambient_visibility, written.ambient_surface, written.ambient_stride = share, surface, stride
+        written = filled(SurfaceCells(), values=share, surface=surface, stride=stride)
         receiver_cells.estimate_ambient_visibility(
             self.config,
             self.params,
@@ -154,8 +155,7 @@ class View:
             receiver_cells.list_patches(patches, listed, count, rows=(rows[-1][1] // 2, patches.shape[0]))
         bounced = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
-        written = ReceiverCells()
-        written.bounced, written.bounced_surface, written.bounced_stride = bounced, surface, stride
+        written = filled(SurfaceCells(), values=bounced, surface=surface, stride=stride)
         inputs = self.config, self.params, self.scene, self.receiver(), listed, count, patch_stride
         for band in rows or [None]:
             receiver_cells.gather_light(*inputs, written, rows=band)
@@ -182,13 +182,12 @@ def middles(stride, size=SIZE_OF_FRAME):
 
 
 def cells_of(view, stride, share=None, share_surface=None, bounced=None, bounced_surface=None):
-    cells = ReceiverCells()
-    cells.ambient_stride = cells.bounced_stride = stride
-    for name, values in (("ambient_visibility", share), ("bounced", bounced)):
+    cells = {}
+    for name, values, surface in (("ambient", share, share_surface), ("bounced", bounced, bounced_surface)):
         if values is not None:
             values = np.broadcast_to(np.asarray(values, np.float32), (*view.cells(stride), 3)).copy()
-            setattr(cells, name, wp.array(values, dtype=wp.vec3))
-    for name, values in (("ambient_surface", share_surface), ("bounced_surface", bounced_surface)):
-        values = np.zeros(view.cells(stride), np.int32) if values is None else values
-        setattr(cells, name, wp.array(values, dtype=wp.int32))
-    return cells
+            values = wp.array(values, dtype=wp.vec3)
+        surface = np.zeros(view.cells(stride), np.int32) if surface is None else surface
+        surface = wp.array(surface, dtype=wp.int32)
+        cells[name] = filled(SurfaceCells(), values=values, surface=surface, stride=stride)
+    return filled(ReceiverCells(), **cells)

@@ -31,7 +31,7 @@ from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.receiver.receiver import ReceiverCells
 from warp_ar.kernels.receiver.receiver_cells import Patch
-from warp_ar.kernels.structs import BOX, DIRECTIONAL, LAMBERT, MIRROR, PHONG, PLANE
+from warp_ar.kernels.structs import BOX, DIRECTIONAL, LAMBERT, MIRROR, PHONG, PLANE, filled
 from warp_ar.scene import Camera, Proxy, Scene
 from warp_ar.scene.ray_scene import HostScene
 
@@ -130,7 +130,7 @@ def test_only_where_light_may_fall(device):
     _, surface = view.share(samples, out=out, bounced=True, cells=cells_of(view, 4, bounced=bounced))
     assert np.argwhere(surface >= 0).tolist() == [[5, 6]]
     rect = 10, 20, 30, 40
-    i, j = (grid * 4 for grid in np.indices(view.cells(4)))
+    i, j = (4 * grid + 2 for grid in np.indices(view.cells(4)))  # pixels at which cells are estimated
     near = (i >= 10 - 8) & (i < 20 + 8) & (j >= 30 - 8) & (j < 40 + 8)
     np.testing.assert_array_equal(View(rect=rect).share(samples)[1] >= 0, near)
 
@@ -203,22 +203,17 @@ def test_a_mesh_hides_as_the_box_that_it_is(device, tmp_path):
 
 
 @wp.kernel(enable_backward=False)
-def look_up_kernel(
-    values: wp.array2d[wp.vec3],
-    surface: wp.array2d[wp.int32],
-    stride: wp.int32,
-    key: wp.int32,
-    found_out: wp.array2d[wp.vec4],
-):
+def look_up_kernel(cells: frame_cells.SurfaceCells, key: wp.int32, found_out: wp.array2d[wp.vec4]):
     i, j = wp.tid()
     size = wp.vec2i(found_out.shape[0], found_out.shape[1])
-    found_out[i, j] = frame_cells.look_up_cells(values, surface, stride, key, size, i, j)
+    found_out[i, j] = frame_cells.look_up_cells(cells, key, size, i, j)
 
 
 def look_up(values, surface, stride, key, size):
     out = wp.zeros(size, wp.vec4)
-    arrays = wp.array(np.asarray(values, np.float32), dtype=wp.vec3), wp.array(surface, dtype=wp.int32)
-    wp.launch(look_up_kernel, size, [*arrays, stride, key], [out])
+    arrays = {"values": wp.array(np.asarray(values, np.float32), dtype=wp.vec3), "surface": wp.array(surface, wp.int32)}
+    cells = filled(frame_cells.SurfaceCells(), **arrays, stride=stride)
+    wp.launch(look_up_kernel, size, [cells, key], [out])
     return out.numpy()
 
 
@@ -277,15 +272,15 @@ def full(view, samples=None, strides=(4, 4, 4), rows=None):
     share = share[0], wp.full(view.cells(strides[0]), 7, dtype=wp.int32)
     for band in rows or [None]:
         view.share(samples, strides[0], out=share, rows=band)
-    cells = ReceiverCells()
-    cells.ambient_visibility, cells.ambient_surface, cells.ambient_stride = *share, strides[0]
+    ambient = filled(frame_cells.SurfaceCells(), values=share[0], surface=share[1], stride=strides[0])
+    cells = filled(ReceiverCells(), ambient=ambient)
     patches = wp.full(view.cells(strides[2]), Patch(), dtype=Patch)
     for band in rows or [None]:
         view.send(strides[2], out=patches, cells=cells, rows=band)
     bounced = wp.full(view.cells(strides[1]), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3)
     bounced = bounced, wp.full(view.cells(strides[1]), 7, dtype=wp.int32)
     view.gather(patches, strides[2], strides[1], out=bounced, rows=rows)
-    cells.bounced, cells.bounced_surface, cells.bounced_stride = *bounced, strides[1]
+    cells.bounced = filled(frame_cells.SurfaceCells(), values=bounced[0], surface=bounced[1], stride=strides[1])
     for band in rows or [None]:
         view.share(samples, strides[0], out=share, cells=cells, bounced=True, rows=band)
     return [view.light(cells), *(array.numpy() for array in (*share, *bounced))]

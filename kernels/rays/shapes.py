@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.rays.mesh_walk import find_closest_face, meets_any_face
-from warp_ar.kernels.structs import BOX, MESH, Shape
+from warp_ar.kernels.structs import BOX, MESH, Hit, RayScene, Shape
 
 wp.set_module_options({"enable_backward": False})
 
@@ -238,13 +238,16 @@ def sphere_uv(normal: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def surface_key(shape: Shape, index: wp.int32, geometric_normal: wp.vec3) -> wp.int32:
-    """Return a number that points on one flat surface share, from the shape's ``index`` and the face of a box."""
-    key = FACES * index
+def surface_key(scene: RayScene, hit: Hit) -> wp.int32:
+    """Return a number that points on one flat surface of a proxy share, the face of a box included; -1 for no hit."""
+    if hit.shape < 0:
+        return -1
+    shape = scene.proxies[hit.shape]
+    key = FACES * hit.shape
     if shape.kind == MESH:
         key += MESH_KEY
     if shape.kind == BOX:
-        local = wp.transpose(shape.rotation) * geometric_normal
+        local = wp.transpose(shape.rotation) * hit.geometric_normal
         for axis in range(3):
             if wp.abs(local[axis]) > 0.7:
                 key += 2 * axis + wp.where(local[axis] > 0.0, 1, 0)

@@ -11,6 +11,7 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.cells import cell_pixel
 from warp_ar.kernels.launch import row_launcher
 from warp_ar.kernels.rays.shapes import FAR, ROUNDING
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, meets_probe
@@ -72,6 +73,38 @@ def make_visible_proxy(config: TraceConfig) -> wp.Function:
         return hit
 
     return visible_proxy
+
+
+@functools.cache
+def make_visible_cell(config: TraceConfig) -> wp.Function:
+    """``visible_cell(params, rays, scene, balls, cell, stride, margin, rect) -> Hit``: the proxy that a cell shows.
+
+    The shape is -1 as for ``visible_proxy``, and for a cell that no pixel of ``rect`` reads: pixels read cells that are
+    estimated at most ``margin`` pixels away.
+    """
+    visible_proxy = make_visible_proxy(config)
+
+    @wp.func(module="unique")
+    def visible_cell(
+        params: FrameParams,
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        balls: wp.array[Probe],
+        cell: wp.vec2i,
+        stride: wp.int32,
+        margin: wp.int32,
+        rect: wp.vec4i,
+    ) -> Hit:
+        row = cell_pixel(cell[0], stride, rays.shape[0])
+        column = cell_pixel(cell[1], stride, rays.shape[1])
+        hit = Hit()
+        hit.shape = -1
+        wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
+        if rect[0] < rect[1] and inside_rect(row, column, wide):
+            hit = visible_proxy(params, rays[row, column], scene, balls)
+        return hit
+
+    return visible_cell
 
 
 def check_edge_samples(count: int) -> None:

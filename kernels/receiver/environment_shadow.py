@@ -48,7 +48,7 @@ from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig, look_up, make_find_in_frame
 from warp_ar.kernels.rays.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.rays.trace import make_trace, offset_origin
-from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
+from warp_ar.kernels.rays.visibility import make_visible_cell, make_visible_proxy
 from warp_ar.kernels.receiver.environment_shadow_bounce import (
     Before,
     ReflectedLight,
@@ -176,13 +176,6 @@ def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.ve
 def first_of_set(i: wp.int32, j: wp.int32, side: wp.int32, count: wp.int32) -> wp.int32:
     """Return the first sample of a cell's set; ``count`` is the number of samples of all sets."""
     return count / (side * side) * ((i % side) * side + j % side)
-
-
-@wp.func
-def can_matter(row: wp.int32, column: wp.int32, margin: wp.int32, rect: wp.vec4i) -> wp.bool:
-    """Return whether the filter may read a cell estimated at this pixel: it reads ``margin`` beyond the rectangle."""
-    wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
-    return rect[0] < rect[1] and inside_rect(row, column, wide)
 
 
 def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
@@ -436,7 +429,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
     chunk = min(config.count // config.partials, CHUNK)
     mask_objects, mask_physical = make_masks(config, chunk)
-    visible_proxy = make_visible_proxy(config.distant.trace)
+    visible_cell = make_visible_cell(config.distant.trace)
     aim, find_sender = make_aim(config.emitters, config.distant.several), make_find_sender(config)
     traced = config.bounce == "traced"
     look_before = None if traced else make_look_before(config.distant)
@@ -469,19 +462,24 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
             if i >= cells_out.surface.shape[0] or j >= cells_out.surface.shape[1]:
                 return
             queue_out.spans[partial, i, j] = wp.vec2i(0, -1)
-        rays = picture.rays
         stride = cells_out.stride
-        row = cell_pixel(i, stride, rays.shape[0])
-        column = cell_pixel(j, stride, rays.shape[1])
+        hit = visible_cell(
+            params[0],
+            picture.rays,
+            scene,
+            distant.probes,
+            wp.vec2i(i, j),
+            stride,
+            stride * side,
+            params[0].shadow_rect,
+        )
         if partial == 0:
-            cells_out.surface[i, j] = -1
-        if not can_matter(row, column, stride * side, params[0].shadow_rect):
-            return
-        hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
+            cells_out.surface[i, j] = surface_key(scene, hit)
         if hit.shape < 0:
             return
+        row = cell_pixel(i, stride, picture.rays.shape[0])
+        column = cell_pixel(j, stride, picture.rays.shape[1])
         if partial == 0:
-            cells_out.surface[i, j] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
             cells_out.ratio[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
             cells_out.bounced[i, j] = wp.vec3(0.0)
 

@@ -28,7 +28,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.environment.lobes import level_from_alpha
-from warp_ar.kernels.materials import lobe_axis, make_surface, reflect
+from warp_ar.kernels.materials import Surface, lobe_axis, make_surface, reflect
 from warp_ar.kernels.objects.reflect import (
     RAY_SPREAD,
     DistantLight,
@@ -144,36 +144,22 @@ def make_look_wide(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
-    """``reflect_back`` without a further ray: both lobes reflect the distant environment.
+    """``reflect_estimated(distant, meeting, surface, before, so_far)``: both lobes reflect the distant environment.
 
     The glossy lobe has at least the width ``meeting.alpha``. The receiver fills the directions below ``before.up``.
     Radiance is limited to ``before.brightest``.
     """
-    surface_at = make_surface(config.models, config.textures)
     reflected_radiance = make_reflected_radiance(config)
     distant_irradiance = make_distant_irradiance(config)
 
     @wp.func(module="unique")
-    def reflect_back(
-        params: FrameParams,
-        picture: Picture,
-        scene: RayScene,
-        distant: DistantLight,
-        meeting: Meeting,
-        before: Before,
-        seed: wp.vec3ui,
-        so_far: ReflectedLight,
+    def reflect_estimated(
+        distant: DistantLight, meeting: Meeting, surface: Surface, before: Before, so_far: ReflectedLight
     ) -> ReflectedLight:
         out = so_far
         hit = meeting.hit
         wo = -meeting.direction
         normal = hit.normal
-        if wp.dot(hit.geometric_normal, wo) < 0.0:
-            normal = -normal
-        cosine = wp.max(wp.dot(normal, wo), 0.0)
-        surface = surface_at(scene, distant.dfg, hit, cosine, RAY_SPREAD)
-        if wp.static(config.textures and config.gathered):
-            out.sent += meeting.stands_for * surface.emission
         of_environment = wp.vec3(0.0)
         of_receiver = wp.vec3(0.0)  # light that it would reflect of a receiver without shadows
         if wp.static(config.diffuse != "none"):
@@ -202,43 +188,38 @@ def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
         out.returned += weight * of_receiver
         return out
 
-    return reflect_back
+    return reflect_estimated
 
 
 @functools.cache
 def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
-    """``reflect_back`` by one ray into one lobe, the glossy one at least ``alpha`` wide: a Monte-Carlo estimate."""
+    """``reflect_traced(params, picture, scene, distant, meeting, surface, seed, so_far)``: by one ray into one lobe.
+
+    The glossy lobe is at least ``meeting.alpha`` wide. It is a Monte-Carlo estimate.
+    """
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     occluded_by_objects = trace.occluded_by_objects
-    surface_at = make_surface(config.models, config.textures)
     find_in_frame = make_find_in_frame(config.trace)
     shade_unoccluded = make_shade_unoccluded(config)
     reflected_radiance = make_reflected_radiance(config)
     distant_irradiance, captured_along = make_distant_irradiance(config), make_radiance_along(config, captured=True)
 
     @wp.func(module="unique")
-    def reflect_back(
+    def reflect_traced(
         params: FrameParams,
         picture: Picture,
         scene: RayScene,
         distant: DistantLight,
         meeting: Meeting,
-        before: Before,
+        surface: Surface,
         seed: wp.vec3ui,
         so_far: ReflectedLight,
     ) -> ReflectedLight:
         out = so_far
         hit = meeting.hit
         wo = -meeting.direction
-        normal = hit.normal
-        geometric = hit.geometric_normal
-        if wp.dot(geometric, wo) < 0.0:
-            normal = -normal
-            geometric = -geometric
-        surface = surface_at(scene, distant.dfg, hit, wp.max(wp.dot(normal, wo), 0.0), RAY_SPREAD)
-        if wp.static(config.textures and config.gathered):
-            out.sent += meeting.stands_for * surface.emission
+        normal, geometric = hit.normal, hit.geometric_normal
         rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
         glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
         if wp.static(config.diffuse == "none") or not knows_irradiance(distant):
@@ -291,7 +272,7 @@ def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
         out.sent += meeting.stands_for * wp.cw_mul(weight, received)
         return out
 
-    return reflect_back
+    return reflect_traced
 
 
 @functools.cache
@@ -313,10 +294,41 @@ def make_look_before(config: DistantLightConfig) -> wp.Function:
     return look_before
 
 
+@functools.cache
 def make_reflect_back(config: DistantLightConfig, traced: bool) -> wp.Function:
-    """``reflect_back(params, picture, scene, distant, meeting, before, seed, so_far) -> ReflectedLight``.
+    """``reflect_back(params, picture, scene, distant, met, before, seed, so_far) -> ReflectedLight``.
 
     It adds the light that an object reflects to ``so_far``: found by another ray if ``traced``, else estimated from
     the surroundings ``before`` the receiver.
     """
-    return make_reflect_traced(config) if traced else make_reflect_estimated(config)
+    surface_at = make_surface(config.models, config.textures)
+    reflect_traced = make_reflect_traced(config) if traced else None
+    reflect_estimated = None if traced else make_reflect_estimated(config)
+
+    @wp.func(module="unique")
+    def reflect_back(
+        params: FrameParams,
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        met: Meeting,
+        before: Before,
+        seed: wp.vec3ui,
+        so_far: ReflectedLight,
+    ) -> ReflectedLight:
+        out = so_far
+        meeting = met
+        if wp.dot(meeting.hit.geometric_normal, meeting.direction) > 0.0:
+            meeting.hit.normal = -meeting.hit.normal
+            meeting.hit.geometric_normal = -meeting.hit.geometric_normal
+        cosine = wp.max(-wp.dot(meeting.hit.normal, meeting.direction), 0.0)
+        surface = surface_at(scene, distant.dfg, meeting.hit, cosine, RAY_SPREAD)
+        if wp.static(config.textures and config.gathered):
+            out.sent += meeting.stands_for * surface.emission
+        if wp.static(traced):
+            out = reflect_traced(params, picture, scene, distant, meeting, surface, seed, out)
+        else:
+            out = reflect_estimated(distant, meeting, surface, before, out)
+        return out
+
+    return reflect_back

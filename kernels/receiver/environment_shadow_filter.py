@@ -218,9 +218,7 @@ def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                 key = found[0]
                 if found[1] != 0:
                     hit = visible_proxy(params[0], rays[i, j], scene, probes)
-                    key = wp.int32(-1)
-                    if hit.shape >= 0:
-                        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                    key = surface_key(scene, hit)
                 if key >= 0:
                     value = ratio_between(cells, key, y, x)
             shadow_ratio_out[i, j] = value

@@ -32,7 +32,7 @@ from typing import Literal
 
 import warp as wp
 
-from warp_ar.kernels.cells import look_up_cells
+from warp_ar.kernels.cells import SurfaceCells, look_up_cells
 from warp_ar.kernels.color import luminance
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls, make_irradiance_at
 from warp_ar.kernels.picture.summed_area import intensity
@@ -158,20 +158,11 @@ def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
 
 @wp.struct
 class ReceiverCells:
-    """Light and visibility per cell (a block of pixels) of the receiver, computed by ``receiver_cells.py``.
+    """Light and visibility per cell (a block of pixels) of the receiver, computed by ``receiver_cells.py``."""
 
-    Each result has its own stride and the key of the surface on which each of its cells lies.
-    """
-
-    ambient_visibility: wp.array2d[wp.vec3]  # share of the environment that reaches a cell
-    ambient_surface: wp.array2d[wp.int32]  # ``surface_key`` of the cell, -1 for none
-    ambient_stride: wp.int32  # pixels per cell
-    bounced: wp.array2d[wp.vec3]  # irradiance of virtual light that other proxies reflect to a cell
-    bounced_surface: wp.array2d[wp.int32]
-    bounced_stride: wp.int32
-    area: wp.array2d[wp.vec3]  # irradiance of emitting objects
-    area_surface: wp.array2d[wp.int32]
-    area_stride: wp.int32
+    ambient: SurfaceCells  # share of the environment that reaches a cell
+    bounced: SurfaceCells  # irradiance of virtual light that other proxies reflect to a cell
+    area: SurfaceCells  # irradiance of emitting objects
 
 
 @wp.struct
@@ -189,30 +180,12 @@ class Receiver:
 
 
 @wp.func
-def look_up_ambient(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
-    """Return (ambient visibility, 1) at the point that a pixel shows, as ``look_up_cells`` does; zero if unknown."""
-    cells = receiver.cells
-    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-    size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
-    return look_up_cells(cells.ambient_visibility, cells.ambient_surface, cells.ambient_stride, key, size, row, col)
-
-
-@wp.func
-def look_up_bounced(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
-    """Return (irradiance of bounced virtual light, 1) at the point that a pixel shows; zero if no cell has it."""
-    cells = receiver.cells
-    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-    size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
-    return look_up_cells(cells.bounced, cells.bounced_surface, cells.bounced_stride, key, size, row, col)
-
-
-@wp.func
-def look_up_area(scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32) -> wp.vec4:
-    """Return (irradiance of emitting objects, 1) at the point that a pixel shows; zero if no cell has it."""
-    cells = receiver.cells
-    key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+def look_up_receiver(
+    scene: RayScene, receiver: Receiver, cells: SurfaceCells, hit: Hit, row: wp.int32, col: wp.int32
+) -> wp.vec4:
+    """Return (value, 1) of the receiver's cells at the point that a pixel shows; zero if no cell has it."""
     size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
-    return look_up_cells(cells.area, cells.area_surface, cells.area_stride, key, size, row, col)
+    return look_up_cells(cells, surface_key(scene, hit), size, row, col)
 
 
 @wp.struct
@@ -256,7 +229,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
             )
             if wp.static(config.ambient_visibility):
                 if not is_mirrored:
-                    left = look_up_ambient(scene, receiver, hit, row, col)
+                    left = look_up_receiver(scene, receiver, receiver.cells.ambient, hit, row, col)
                     if left[3] > 0.0:
                         distant = wp.cw_mul(distant, wp.vec3(left[0], left[1], left[2]))
             matter.kd = wp.vec3(

@@ -40,7 +40,7 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.cells import cell_pixel
+from warp_ar.kernels.cells import SurfaceCells, cell_pixel
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
 from warp_ar.kernels.environment.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.environment.probe_weights import probe_share
@@ -50,14 +50,13 @@ from warp_ar.kernels.objects.reflect import look_up, make_find_in_frame
 from warp_ar.kernels.rays.shadow import make_shadow, sample_light, tile_turn
 from warp_ar.kernels.rays.shapes import intersect_sphere, surface_key
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
-from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
+from warp_ar.kernels.rays.visibility import make_visible_cell
 from warp_ar.kernels.receiver.receiver import (
     DEFAULT_REFLECTANCE,
     Matter,
     Receiver,
-    ReceiverCells,
     RelightConfig,
-    look_up_bounced,
+    look_up_receiver,
 )
 from warp_ar.kernels.receiver.relight import make_area_response, make_direct_lighting
 from warp_ar.kernels.structs import MIRROR, PHONG, PLANE, FrameParams, Hit, Light, RayScene
@@ -70,6 +69,10 @@ NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
 """Ratio of bounced to environment light that is treated as 0: at most an eighth of an 8-bit code."""
 MIN_FACING = wp.constant(wp.float32(0.02))
 """Least cosine by which the area of a patch is divided: at smaller ones it would reach over the horizon."""
+
+
+MARGIN = wp.constant(2)
+"""Cells outside the rectangle of lit pixels that are estimated, too: its pixels interpolate."""
 
 
 @wp.struct
@@ -100,13 +103,6 @@ def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool
     beside = wp.dot(away, away) - radius * radius
     along = wp.dot(away, direction)
     return beside <= 0.0 or (along > 0.0 and along * along > beside)
-
-
-@wp.func
-def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect: wp.vec4i) -> wp.bool:
-    """Return whether a pixel of the rectangle may read this cell when it interpolates."""
-    reach = wp.vec4i(rect[0] - 2 * stride, rect[1] + 2 * stride, rect[2] - 2 * stride, rect[3] + 2 * stride)
-    return rect[0] < rect[1] and inside_rect(cell_row * stride, cell_col * stride, reach)
 
 
 @functools.cache
@@ -213,7 +209,7 @@ def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
 @functools.cache
 def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``estimate_ambient_visibility``."""
-    visible_proxy = make_visible_proxy(config.trace)
+    visible_cell = make_visible_cell(config.trace)
     find_hider = make_find_hider(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -227,35 +223,31 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
         samples: wp.array[EnvironmentSample],
         bounced: wp.bool,
         # Out:
-        cells_out: ReceiverCells,
+        cells_out: SurfaceCells,
     ):
         ci, cj = wp.tid()
         ci += row_start
         rays = receiver.picture.rays
-        stride = cells_out.ambient_stride
-        share_out = cells_out.ambient_visibility
-        surface_out = cells_out.ambient_surface
+        rect = params[0].light_rect
+        stride = cells_out.stride
         if not bounced:
-            surface_out[ci, cj] = -1
-        elif surface_out[ci, cj] >= 0:
+            cells_out.surface[ci, cj] = -1
+        elif cells_out.surface[ci, cj] >= 0:
             return
-        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
-            return
-        i = cell_pixel(ci, stride, rays.shape[0])
-        j = cell_pixel(cj, stride, rays.shape[1])
-        hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
+        hit = visible_cell(params[0], rays, scene, receiver.probes, wp.vec2i(ci, cj), stride, MARGIN * stride, rect)
         if hit.shape < 0:
             return
-        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
         needed = bool(False)
         if bounced:
-            sent = look_up_bounced(scene, receiver, hit, i, j)
+            i = cell_pixel(ci, stride, rays.shape[0])
+            j = cell_pixel(cj, stride, rays.shape[1])
+            sent = look_up_receiver(scene, receiver, receiver.cells.bounced, hit, i, j)
             needed = sent[0] + sent[1] + sent[2] > 0.0
         else:
             needed = is_shone_on(lights, hit)
         if not needed:
             return
-        surface_out[ci, cj] = key
+        cells_out.surface[ci, cj] = surface_key(scene, hit)
         solids = bound_solids(scene)
         whole = wp.vec3()
         lost = wp.vec3()
@@ -272,7 +264,7 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
                 hider = find_hider(params[0], scene, receiver, hit, toward, solids)
                 if hider.hides:
                     lost += cosine * toward.measure * (sample.radiance - hider.radiance)
-        share_out[ci, cj] = visible_shares_of(lost, whole)
+        cells_out.values[ci, cj] = visible_shares_of(lost, whole)
 
     return ambient_visibility_kernel
 
@@ -280,7 +272,7 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
 @functools.cache
 def make_area_light_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``estimate_area_light``."""
-    visible_proxy = make_visible_proxy(config.trace)
+    visible_cell = make_visible_cell(config.trace)
     area_response = make_area_response(dataclasses.replace(config, method="flat"))
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -291,22 +283,17 @@ def make_area_light_kernel(config: RelightConfig) -> wp.Kernel:
         scene: RayScene,
         receiver: Receiver,
         # Out:
-        cells_out: ReceiverCells,
+        cells_out: SurfaceCells,
     ):
         ci, cj = wp.tid()
         ci += row_start
         rays = receiver.picture.rays
-        stride = cells_out.area_stride
-        cells_out.area_surface[ci, cj] = -1
-        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
-            return
-        i = cell_pixel(ci, stride, rays.shape[0])
-        j = cell_pixel(cj, stride, rays.shape[1])
-        hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
-        if hit.shape < 0:
-            return
-        cells_out.area_surface[ci, cj] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-        cells_out.area[ci, cj] = area_response(scene, receiver, hit, Matter(), tile_turn(ci, cj))
+        rect = params[0].light_rect
+        stride = cells_out.stride
+        hit = visible_cell(params[0], rays, scene, receiver.probes, wp.vec2i(ci, cj), stride, MARGIN * stride, rect)
+        cells_out.surface[ci, cj] = surface_key(scene, hit)
+        if hit.shape >= 0:
+            cells_out.values[ci, cj] = area_response(scene, receiver, hit, Matter(), tile_turn(ci, cj))
 
     return area_light_kernel
 
@@ -357,7 +344,7 @@ def make_sent_by_object(trace: TraceConfig) -> wp.Function:
 @functools.cache
 def make_send_light_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``send_light``."""
-    visible_proxy = make_visible_proxy(config.trace)
+    visible_cell = make_visible_cell(config.trace)
     direct_lighting = make_direct_lighting(dataclasses.replace(config, bounced=False))
     has_objects = bool(config.trace.objects)
     closest_object = make_trace(config.trace).closest_object
@@ -381,37 +368,36 @@ def make_send_light_kernel(config: RelightConfig) -> wp.Kernel:
         patch = Patch()
         i = cell_pixel(ci, stride, rays.shape[0])
         j = cell_pixel(cj, stride, rays.shape[1])
-        if inside_rect(i, j, params[0].light_rect):
-            hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
-            if hit.shape >= 0:
-                added = wp.vec3()
-                is_object = bool(False)
-                if wp.static(has_objects):
-                    toward = params[0].world_from_camera * wp.vec3(rays[i, j][0], rays[i, j][1], 1.0)
-                    item = closest_object(scene, params[0].camera_position, toward, hit.t)
-                    if item.shape >= 0:
-                        is_object = True
-                        hit = item
-                        if wp.dot(hit.geometric_normal, toward) > 0.0:
-                            hit.geometric_normal = -hit.geometric_normal
-                            hit.normal = -hit.normal
-                        added = sent_by_object(scene, lights, hit)
-                if not is_object:
-                    lit = direct_lighting(scene, lights, receiver, hit, i, j, wp.vec3(), tile_turn(ci, cj))
-                    added = lit.added
-                if added[0] + added[1] + added[2] > 0.0:
-                    ray = rays[i, j]
-                    # A pixel's solid angle is cos^3 / (fx fy), the distance to its point t / cos.
-                    length = wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + 1.0)
-                    direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0) / length
-                    facing = wp.max(-wp.dot(direction, hit.geometric_normal), MIN_FACING)
-                    # A patch at the frame's border has fewer pixels.
-                    rows = wp.min(stride, rays.shape[0] - ci * stride)
-                    pixels = wp.float32(rows * wp.min(stride, rays.shape[1] - cj * stride))
-                    patch.area = pixels * hit.t * hit.t / (length * params[0].focal[0] * params[0].focal[1] * facing)
-                    patch.position = hit.point
-                    patch.normal = hit.geometric_normal
-                    patch.flux = patch.area * added
+        hit = visible_cell(params[0], rays, scene, receiver.probes, wp.vec2i(ci, cj), stride, 0, params[0].light_rect)
+        if hit.shape >= 0:
+            added = wp.vec3()
+            is_object = bool(False)
+            if wp.static(has_objects):
+                toward = params[0].world_from_camera * wp.vec3(rays[i, j][0], rays[i, j][1], 1.0)
+                item = closest_object(scene, params[0].camera_position, toward, hit.t)
+                if item.shape >= 0:
+                    is_object = True
+                    hit = item
+                    if wp.dot(hit.geometric_normal, toward) > 0.0:
+                        hit.geometric_normal = -hit.geometric_normal
+                        hit.normal = -hit.normal
+                    added = sent_by_object(scene, lights, hit)
+            if not is_object:
+                lit = direct_lighting(scene, lights, receiver, hit, i, j, wp.vec3(), tile_turn(ci, cj))
+                added = lit.added
+            if added[0] + added[1] + added[2] > 0.0:
+                ray = rays[i, j]
+                # A pixel's solid angle is cos^3 / (fx fy), the distance to its point t / cos.
+                length = wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + 1.0)
+                direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0) / length
+                facing = wp.max(-wp.dot(direction, hit.geometric_normal), MIN_FACING)
+                # A patch at the frame's border has fewer pixels.
+                rows = wp.min(stride, rays.shape[0] - ci * stride)
+                pixels = wp.float32(rows * wp.min(stride, rays.shape[1] - cj * stride))
+                patch.area = pixels * hit.t * hit.t / (length * params[0].focal[0] * params[0].focal[1] * facing)
+                patch.position = hit.point
+                patch.normal = hit.geometric_normal
+                patch.flux = patch.area * added
         patches_out[ci, cj] = patch
 
     return send_light_kernel
@@ -439,7 +425,7 @@ def list_patches_kernel(
 @functools.cache
 def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel of ``gather_light``."""
-    visible_proxy = make_visible_proxy(config.trace)
+    visible_cell = make_visible_cell(config.trace)
     mean_facing = make_mean_facing(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -453,24 +439,19 @@ def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
         count: wp.array[wp.int32],
         patch_stride: wp.int32,
         # Out:
-        cells_out: ReceiverCells,
+        cells_out: SurfaceCells,
     ):
         ci, cj = wp.tid()
         ci += row_start
         rays = receiver.picture.rays
-        stride = cells_out.bounced_stride
-        cells_out.bounced_surface[ci, cj] = -1
-        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
-            return
-        i = cell_pixel(ci, stride, rays.shape[0])
-        j = cell_pixel(cj, stride, rays.shape[1])
-        hit = visible_proxy(params[0], rays[i, j], scene, receiver.probes)
+        rect = params[0].light_rect
+        stride = cells_out.stride
+        hit = visible_cell(params[0], rays, scene, receiver.probes, wp.vec2i(ci, cj), stride, MARGIN * stride, rect)
+        cells_out.surface[ci, cj] = surface_key(scene, hit)
         if hit.shape < 0:
             return
-        cells_out.bounced_surface[ci, cj] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
         total = wp.vec3()
         # Only rows in light_rect: the others may hold patches of an earlier frame.
-        rect = params[0].light_rect
         for row in range(rect[0] / patch_stride, wp.min((rect[1] - 1) / patch_stride + 1, patches.shape[0])):
             for k in range(count[row]):
                 patch = patches[row, k]
@@ -485,14 +466,12 @@ def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
         for channel in range(3):
             if total[channel] > NEGLIGIBLE * distant[channel]:
                 matters = True
-        cells_out.bounced[ci, cj] = wp.where(matters, total, wp.vec3(0.0, 0.0, 0.0))
+        cells_out.values[ci, cj] = wp.where(matters, total, wp.vec3(0.0, 0.0, 0.0))
 
     return gather_light_kernel
 
 
-estimate_ambient_visibility = row_launcher(
-    make_ambient_visibility_kernel, like=lambda *given: given[-1].ambient_visibility
-)
+estimate_ambient_visibility = row_launcher(make_ambient_visibility_kernel, like=lambda *given: given[-1].values)
 """Estimate the share of the environment that reaches the receiver, for cells on which virtual lights may shine.
 
 Args:
@@ -505,11 +484,11 @@ Args:
     samples: (n,) samples of the environment, the same for all cells, so that neighbours do not differ by noise. If n is
         a power of 2, the first n of a longer sequence are an aligned block of Sobol's sequence.
     bounced: Whether to estimate the cells that only bounced light reaches, and keep those of the first call.
-    cells_out: Cells whose ambient visibility and its surface are written.
+    cells_out: Cells of ambient visibility.
 """
 
 
-estimate_area_light = row_launcher(make_area_light_kernel, like=lambda *given: given[-1].area)
+estimate_area_light = row_launcher(make_area_light_kernel, like=lambda *given: given[-1].values)
 """Find the irradiance that emitting objects send to the receiver, per cell.
 
 Args:
@@ -517,7 +496,7 @@ Args:
     params: (1,) FrameParams: camera and light_rect.
     scene: Objects and proxies.
     receiver: From ``make_receiver``: picture and balls.
-    cells_out: Cells whose irradiance and its surface are written.
+    cells_out: Cells of that irradiance.
 """
 
 
@@ -545,7 +524,7 @@ Args:
 """
 
 
-gather_light = row_launcher(make_gather_light_kernel, like=lambda *given: given[-1].bounced)
+gather_light = row_launcher(make_gather_light_kernel, like=lambda *given: given[-1].values)
 """Sum the irradiance that patches send to each cell of the receiver.
 
 Args:
@@ -556,6 +535,5 @@ Args:
     patches: (r, c) from ``list_patches``; only rows in light_rect are read.
     count: (r,) number of patches of each row that reflect light.
     patch_stride: Pixels along a patch.
-    cells_out: Cells whose bounced light and its surface are written; bounced light is 0 where it is less than
-        ``NEGLIGIBLE`` times the environment's.
+    cells_out: Cells of bounced light; it is 0 where it is less than ``NEGLIGIBLE`` times the environment's.
 """

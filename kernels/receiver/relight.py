@@ -44,8 +44,7 @@ from warp_ar.kernels.receiver.receiver import (
     Matter,
     Receiver,
     RelightConfig,
-    look_up_area,
-    look_up_bounced,
+    look_up_receiver,
     make_find_matter,
     make_respond,
 )
@@ -158,7 +157,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                 stored = wp.vec4()
                 if wp.static(config.area_cells):
                     if mirror[0] <= 0.0:
-                        stored = look_up_area(scene, receiver, hit, row, col)
+                        stored = look_up_receiver(scene, receiver, receiver.cells.area, hit, row, col)
                 by_areas = wp.vec3(stored[0], stored[1], stored[2])
                 if wp.static(config.method != "flat"):
                     if not known and (stored[3] <= 0.0 or wp.max(by_areas) > 0.0):
@@ -171,7 +170,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                     added += by_areas
         if wp.static(config.bounced):
             if mirror[0] <= 0.0:
-                bounced = look_up_bounced(scene, receiver, hit, row, col)
+                bounced = look_up_receiver(scene, receiver, receiver.cells.bounced, hit, row, col)
                 if bounced[0] + bounced[1] + bounced[2] > 0.0:
                     result.visibility |= _LIT
                     if not known:
@@ -211,9 +210,8 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
             visibility_out[i, j] = _NOTHING
         if wp.static(config.bounced):
             if not inside_rect(i, j, params[0].direct_rect):
-                cells = receiver.cells
                 size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
-                if not any_cell_above_zero(cells.bounced, cells.bounced_surface, cells.bounced_stride, size, i, j):
+                if not any_cell_above_zero(receiver.cells.bounced, size, i, j):
                     return
         ray = receiver.picture.rays[i, j]
         direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
@@ -228,7 +226,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         lit = direct_lighting(scene, lights, receiver, hit, i, j, black, tile_turn(i, j))
         added_out[i, j] = lit.added
         if wp.static(config.edge_samples > 1):
-            surface = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+            surface = surface_key(scene, hit)
             visibility_out[i, j] = (surface << _SURFACE) | lit.visibility
 
     return relight_kernel

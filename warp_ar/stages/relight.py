@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.cells import cell_shape, cell_stride
+from warp_ar.kernels.cells import SurfaceCells, cell_shape, cell_stride
 from warp_ar.kernels.receiver import receiver_cells, relight
 from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightConfig
-from warp_ar.kernels.structs import PLANE
+from warp_ar.kernels.structs import PLANE, filled
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, over_rows
 from warp_ar.stages.features import AREA_CELLS, Features, area_method, sheds_light
@@ -94,19 +94,12 @@ class Relight(Stage):
         if self.request.quality.edge_samples > 1:
             specs["relight_visibility"] = ArraySpec(self.shape, wp.int32)
             specs |= edge_arrays(self.request, self.name)
-        if self.features.ambient_visibility:
-            cells = _cells(self.request, _grain(self.features).ambient)
-            specs["relight_ambient_visibility"] = ArraySpec(cells, wp.vec3)
-            specs["relight_ambient_surface"] = ArraySpec(cells, wp.int32, -1)
-        if self.features.area_cells:
-            cells = _cells(self.request, AREA_CELLS[area_method(self.request.quality)][1])
-            specs["relight_area"] = ArraySpec(cells, wp.vec3)
-            specs["relight_area_surface"] = ArraySpec(cells, wp.int32, -1)
+        for name, stride in _strides(self.features).items():
+            cells = cell_shape(self.request.size, stride)
+            specs[f"relight_{name}"] = ArraySpec(cells, wp.vec3)
+            specs[f"relight_{name}_surface"] = ArraySpec(cells, wp.int32, -1)
         if self.features.bounced:
-            grain = _grain(self.features)
-            cells, patches = _cells(self.request, grain.bounced), _cells(self.request, grain.patch)
-            specs["relight_bounced"] = ArraySpec(cells, wp.vec3)
-            specs["relight_bounced_surface"] = ArraySpec(cells, wp.int32, -1)
+            patches = cell_shape(self.request.size, _patch_stride(self.features))
             specs["relight_patches"] = ArraySpec(patches, receiver_cells.Patch, receiver_cells.Patch())
             specs["relight_listed"] = ArraySpec(patches, receiver_cells.Patch, receiver_cells.Patch())
             specs["relight_count"] = ArraySpec(patches[:1], wp.int32)
@@ -147,28 +140,29 @@ class Relight(Stage):
 
         def ambient_pass(bounced: bool) -> Pass:
             samples = arrays["environment_samples"][: _grain(self.features).samples]
-            count = cells.ambient_visibility.shape[0]
-            extent = rows_of(int(cells.ambient_stride), count, 2)
             estimate = receiver_cells.estimate_ambient_visibility
-            return over_rows(count, estimate, place, *inputs, samples, bounced, cells, extent=extent)
+            return cell_pass(cells.ambient, estimate, place, *inputs, samples, bounced)
+
+        def cell_pass(cells: SurfaceCells, launcher: Callable[..., None], *given: Any) -> Pass:
+            count = len(cells.values)
+            extent = rows_of(int(cells.stride), count, int(receiver_cells.MARGIN))
+            return over_rows(count, launcher, *given, cells, extent=extent)
 
         if config.area_cells:
             samples = AREA_CELLS[area_method(self.request.quality)][0]
-            estimate, count = receiver_cells.estimate_area_light, len(cells.area)
-            extent = rows_of(int(cells.area_stride), count, 2)
             asked = dataclasses.replace(place, area_samples=samples)
-            passes.append(over_rows(count, estimate, asked, params, scene, receiver, cells, extent=extent))
+            passes.append(cell_pass(cells.area, receiver_cells.estimate_area_light, asked, params, scene, receiver))
         if config.ambient_visibility:
             passes.append(ambient_pass(bounced=False))
         if config.bounced:
             patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
-            wide, height = _stride(self.request, _grain(self.features).patch), len(cells.bounced)
-            lit, lit_cells = rows_of(wide, len(patches), 0), rows_of(int(cells.bounced_stride), height, 2)
-            gather = receiver_cells.gather_light, place, params, scene, receiver, listed, count, wide, cells
+            wide = _patch_stride(self.features)
+            lit = rows_of(wide, len(patches), 0)
+            gather = receiver_cells.gather_light, place, params, scene, receiver, listed, count, wide
             passes += [
                 over_rows(len(patches), receiver_cells.send_light, place, *inputs, wide, patches, extent=lit),
                 over_rows(len(patches), receiver_cells.list_patches, patches, listed, count, extent=lit),
-                over_rows(height, *gather, extent=lit_cells),
+                cell_pass(cells.bounced, *gather),
             ]
             if config.ambient_visibility:
                 passes.append(ambient_pass(bounced=True))
@@ -187,27 +181,26 @@ def _grain(features: Features) -> Grain:
     return GRAINS[features.relight_method]
 
 
-def _stride(request: Request, pixels: int) -> int:
-    return int(cell_stride(pixels, request.size[1]))
+def _patch_stride(features: Features) -> int:
+    return int(cell_stride(_grain(features).patch, features.request.size[1]))
 
 
-def _cells(request: Request, pixels: int) -> tuple[int, int]:
-    rows, columns = cell_shape(request.size, _stride(request, pixels))
-    return rows, columns
+def _strides(features: Features) -> dict[str, int]:
+    """Return the pixels along a cell for each result per cell that the request needs."""
+    pixels = {}
+    if features.ambient_visibility:
+        pixels["ambient"] = _grain(features).ambient
+    if features.bounced:
+        pixels["bounced"] = _grain(features).bounced
+    if features.area_cells:
+        pixels["area"] = AREA_CELLS[area_method(features.request.quality)][1]
+    return {name: cell_stride(count, features.request.size[1]) for name, count in pixels.items()}
 
 
 def make_cells(features: Features, arrays: Arrays) -> ReceiverCells:
     """Return the cells of a request as kernels read them."""
-    cells = ReceiverCells()
-    if features.relight_method in GRAINS:
-        grain, request = _grain(features), features.request
-        cells.ambient_stride, cells.bounced_stride = _stride(request, grain.ambient), _stride(request, grain.bounced)
-    if features.area_cells:
-        cells.area, cells.area_surface = arrays["relight_area"], arrays["relight_area_surface"]
-        cells.area_stride = _stride(features.request, AREA_CELLS[area_method(features.request.quality)][1])
-    if features.ambient_visibility:
-        cells.ambient_visibility = arrays["relight_ambient_visibility"]
-        cells.ambient_surface = arrays["relight_ambient_surface"]
-    if features.bounced:
-        cells.bounced, cells.bounced_surface = arrays["relight_bounced"], arrays["relight_bounced_surface"]
-    return cells
+    cells = {}
+    for name, stride in _strides(features).items():
+        values, surface = arrays[f"relight_{name}"], arrays[f"relight_{name}_surface"]
+        cells[name] = filled(SurfaceCells(), values=values, surface=surface, stride=stride)
+    return filled(ReceiverCells(), **cells)
