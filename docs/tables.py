@@ -40,7 +40,7 @@ COMMANDS = (
 
 def scene_keys() -> str:
     """Tables of a scene file's keys."""
-    from warp_ar.scene.reference import as_markdown
+    from warp_ar.scene.key_tables import as_markdown
 
     return as_markdown()
 

@@ -18,7 +18,7 @@ from tests.kernel_rig import (
     tables,
     trace_of,
 )
-from tests.reference import color as reference_color
+from tests.twins import color as reference_color
 from warp_ar.kernels import color
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.objects.shade import ShadeConfig

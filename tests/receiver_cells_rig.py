@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from tests.kernel_rig import constant_environment, records, shape, tables, trace_of
-from tests.reference import receiver_cells as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, point
+from tests.twins import receiver_cells as reference
 from warp_ar.kernels.cells import SurfaceCells
 from warp_ar.kernels.receiver import receiver_cells, relight
 from warp_ar.kernels.receiver.receiver import ReceiverCells, RelightConfig, make_receiver

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from tests.kernel_rig import records
-from tests.reference import recover as reference
+from tests.twins import recover as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.recovery import recover as kernels
 from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from tests.kernel_rig import constant_environment, records, shape, tables, trace_of
-from tests.reference import relight as reference
+from tests.twins import relight as reference
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.receiver import relight
 from warp_ar.kernels.receiver.receiver import RelightConfig, make_receiver

@@ -4,7 +4,7 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import records
-from tests.reference import accumulate as reference
+from tests.twins import accumulate as reference
 from warp_ar.kernels.environment import accumulate
 from warp_ar.kernels.structs import FrameParams, make_environment_view
 

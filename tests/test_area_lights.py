@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from tests.kernel_rig import SMALL_CAMERA, look_at
-from tests.reference import area_lights as twin
+from tests.twins import area_lights as twin
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.rays.area_lights import AreaSample, area_numbers, make_area_count, make_area_sample
 from warp_ar.kernels.structs import RayScene

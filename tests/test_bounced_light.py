@@ -7,8 +7,8 @@ import warp as wp
 from tests.error_model import check_error
 from tests.kernel_rig import shape
 from tests.receiver_cells_rig import FOCAL, PATCHES, SIZE_OF_FRAME, WHITE, View, middles, patches_of
-from tests.reference import receiver_cells as reference
 from tests.relight_rig import CAMERA, FLOAT_ERROR, POINTS, point
+from tests.twins import receiver_cells as reference
 from warp_ar.kernels.receiver import receiver_cells
 from warp_ar.kernels.receiver.receiver_cells import Patch
 from warp_ar.kernels.structs import (

@@ -12,9 +12,9 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.reference import bracket as reference
-from tests.reference import latlong as latlong_reference
-from tests.reference import unwrap as probe_reference
+from tests.twins import bracket as reference
+from tests.twins import latlong as latlong_reference
+from tests.twins import unwrap as probe_reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table

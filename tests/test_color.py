@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.reference import color as reference
+from tests.twins import color as reference
 from warp_ar.errors import SceneError
 from warp_ar.kernels import color
 

@@ -6,8 +6,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import records, tables
-from tests.reference import color as reference_color
-from tests.reference import composite as reference
+from tests.twins import color as reference_color
+from tests.twins import composite as reference
 from warp_ar.kernels import color
 from warp_ar.kernels.picture import composite
 from warp_ar.kernels.structs import FrameParams

@@ -7,7 +7,7 @@ import pytest
 
 from tests.error_model import check_error
 from tests.layer_rig import POSES, make_frame, make_scene
-from tests.reference import coverage as reference
+from tests.twins import coverage as reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.receiver.surfaces import RANKS
 from warp_ar.scene.geometry import rotation_matrix

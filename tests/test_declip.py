@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.reference import color as reference_color
-from tests.reference import declip as reference
+from tests.twins import color as reference_color
+from tests.twins import declip as reference
 from warp_ar.kernels import color
 from warp_ar.kernels.picture import declip
 from warp_ar.kernels.structs import PLANE, FrameParams, Probe, RayScene, Shape, make_picture

@@ -39,7 +39,7 @@ assert len(frames) == 24 and frames[3].image[0, 255].tolist() == [255, 255, 255]
 CASES = {
     "stage": (5, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-n0", "tests/test_frame_luminance.py"]),
     "method": (2, ["-c", METHOD]),
-    "scene-key": (1, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-n0", "tests/test_reference.py"]),
+    "scene-key": (1, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-n0", "tests/test_key_tables.py"]),
     "source": (2, ["-c", SOURCE]),
 }
 """Files that an example touches, and what Python runs to try it."""

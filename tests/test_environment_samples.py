@@ -16,7 +16,7 @@ from tests.environment_shadow_rig import (
     with_sun,
 )
 from tests.error_model import check_error
-from tests.reference import environment_shadow as reference
+from tests.twins import environment_shadow as reference
 from warp_ar.kernels.environment import environment_samples
 
 # --- Samples ----------------------------------------------------------------------------------------------------------

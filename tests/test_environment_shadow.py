@@ -20,8 +20,8 @@ from tests.environment_shadow_rig import (
 )
 from tests.error_model import check_error
 from tests.kernel_rig import shape
-from tests.reference import environment_shadow as reference
 from tests.relight_rig import CAMERA, DESK, POINTS, H, W
+from tests.twins import environment_shadow as reference
 from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.structs import BOX
 

@@ -4,10 +4,10 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import tables
-from tests.reference import color as reference_color
-from tests.reference import composite as reference_composite
-from tests.reference import expose as reference
 from tests.test_composite import H, make_arrays, make_layers, make_params
+from tests.twins import color as reference_color
+from tests.twins import composite as reference_composite
+from tests.twins import expose as reference
 from warp_ar.kernels import color
 from warp_ar.kernels.color import decode_codes
 from warp_ar.kernels.picture import expose, summed_area

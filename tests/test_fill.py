@@ -4,8 +4,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import records
-from tests.reference import fill as reference
-from tests.reference import latlong
+from tests.twins import fill as reference
+from tests.twins import latlong
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.environment import fill

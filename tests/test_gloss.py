@@ -21,9 +21,9 @@ from tests.kernel_rig import (
     trace_of,
 )
 from tests.mirror_ball_rig import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame
-from tests.reference import color as reference_color
-from tests.reference import gloss as reference
-from tests.reference.visibility import Body
+from tests.twins import color as reference_color
+from tests.twins import gloss as reference
+from tests.twins.visibility import Body
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig

@@ -9,9 +9,9 @@ from tests.environment_shadow_rig import SUM_ERROR, sky, sphere
 from tests.environment_shadow_rig import run as run_shadow
 from tests.kernel_rig import constant_environment
 from tests.receiver_cells_rig import View, box, middles
-from tests.reference.probe_weights import weights
 from tests.relight_rig import DESK, FLOAT_ERROR, POINTS, point
 from tests.relight_rig import run as run_relight
+from tests.twins.probe_weights import weights
 from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls

@@ -6,8 +6,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import SMALL_DESK, launch_passes
-from tests.reference import irradiance as reference
-from tests.reference import latlong
+from tests.twins import irradiance as reference
+from tests.twins import latlong
 from warp_ar.kernels.environment import irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.scene import loads_scene

@@ -4,8 +4,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import records
-from tests.reference import key_lights as reference
-from tests.reference import latlong
+from tests.twins import key_lights as reference
+from tests.twins import latlong
 from warp_ar.kernels.emitters import MAX_GAIN, REACH, add_emitters, correct_parallax
 from warp_ar.kernels.environment import key_lights
 from warp_ar.kernels.structs import Emitter, KeyLight

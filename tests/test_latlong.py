@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.reference import latlong as reference
+from tests.twins import latlong as reference
 from warp_ar.kernels import latlong
 
 # A float32 angle of up to pi has an error of 1e-7; sine, cosine and arc tangent add as much each.

@@ -11,7 +11,7 @@ import OpenEXR
 import pytest
 
 from tests.layer_rig import POSES, SIZE, make_frame, make_scene, run
-from tests.reference import color as reference_color
+from tests.twins import color as reference_color
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SinkError
 from warp_ar.output.layer_file import (

@@ -55,7 +55,7 @@ def test_a_stage_has_a_file_of_its_name() -> None:
 
 LACKING = {
     "kernels/*/{}.py": {"captured", "coverage"},
-    "tests/reference/{}.py": {"captured", "environment_samples", "motion", "separate"},
+    "tests/twins/{}.py": {"captured", "environment_samples", "motion", "separate"},
     "tests/test_{}.py": set(),
 }
 """By place, the stages that have no file there; docs/developing.md says why."""

@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 from tests.recover_rig import DistantLight, cells_of, lit_environment, scene  # noqa: F401
-from tests.reference import latlong
-from tests.reference import recover as reference
+from tests.twins import latlong
+from tests.twins import recover as reference
 from warp_ar.kernels.recovery.light_level import MOST, STILL, apply_level, follow_level, sum_upward
 from warp_ar.kernels.recovery.recover import Observation
 from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell

@@ -10,7 +10,7 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import TEXTURES, records
-from tests.reference import materials as reference
+from tests.twins import materials as reference
 from warp_ar.kernels.materials import (
     MIN_ALPHA,
     ggx_lobe,

@@ -39,10 +39,10 @@ from tests.mirror_ball_rig import (
     on_desk,
     run,
 )
-from tests.reference import color as reference_color
-from tests.reference import mirror_ball as reference
-from tests.reference import relight as reference_relight
-from tests.reference.visibility import Body
+from tests.twins import color as reference_color
+from tests.twins import mirror_ball as reference
+from tests.twins import relight as reference_relight
+from tests.twins.visibility import Body
 from warp_ar.kernels.structs import (
     BOX,
     PLANE,

@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.error_model import check_error
 from tests.layer_rig import POSES, SIZE, TIMES, make_frame, make_scene, run
-from tests.reference import surfaces as reference
+from tests.twins import surfaces as reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene.geometry import rotation_matrix
 

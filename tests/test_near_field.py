@@ -7,8 +7,8 @@ import warp as wp
 from tests.environment_shadow_rig import COUNT, SIDE, draw, sky, sphere
 from tests.error_model import check_error
 from tests.kernel_rig import TEXTURES, camera_fields, constant_environment, records, tables, trace_of
-from tests.reference import near_field as reference
 from tests.relight_rig import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W
+from tests.twins import near_field as reference
 from warp_ar.kernels.environment.lobes import lobe_texels
 from warp_ar.kernels.objects import near_field
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig

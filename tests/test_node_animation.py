@@ -11,8 +11,8 @@ import pytest
 
 from tests.gltf_files import Gltf
 from tests.layer_rig import POSES, make_scene
-from tests.reference import node_animation as twin
 from tests.test_object_materials import look
+from tests.twins import node_animation as twin
 from warp_ar.errors import SceneError
 from warp_ar.output.gltf_file import write_glb
 from warp_ar.output.shot import Shot

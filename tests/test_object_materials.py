@@ -12,8 +12,8 @@ import warp as wp
 from PIL import Image
 
 from tests.gltf_files import SQUARE_UVS, Gltf
-from tests.reference import prefilter as reference
 from tests.test_foreign_files import adobe_profile, as_srgb
+from tests.twins import prefilter as reference
 from warp_ar.errors import SceneError
 from warp_ar.kernels.materials import make_surface
 from warp_ar.kernels.rays.shapes import FAR

@@ -6,8 +6,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import SMALL_DESK, launch_passes
-from tests.reference import latlong
-from tests.reference import prefilter as reference
+from tests.twins import latlong
+from tests.twins import prefilter as reference
 from warp_ar.kernels.environment.lobes import (
     level_from_roughness,
     level_from_shininess,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.reference import probe_weights as reference
+from tests.twins import probe_weights as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.environment import probe_weights
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls

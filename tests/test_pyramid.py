@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.reference import pyramid as reference
+from tests.twins import pyramid as reference
 from warp_ar.kernels.environment import pyramid
 from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_direction
 

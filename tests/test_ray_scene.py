@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 
 from tests.kernel_rig import look_at
-from tests.reference import visibility as reference
+from tests.twins import visibility as reference
 from warp_ar import scene as scenes
 from warp_ar.errors import SceneError
 from warp_ar.kernels import structs

@@ -23,10 +23,10 @@ from tests.receiver_cells_rig import (
     middles,
     pixel_rays,
 )
-from tests.reference import receiver_cells as reference
-from tests.reference import relight as reference_relight
-from tests.reference.environment_shadow import sphere_form_factor
 from tests.relight_rig import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, point
+from tests.twins import receiver_cells as reference
+from tests.twins import relight as reference_relight
+from tests.twins.environment_shadow import sphere_form_factor
 from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.receiver.receiver import ReceiverCells

@@ -22,7 +22,7 @@ from tests.recover_rig import (  # noqa: F401  # noqa: F401
     seen,
     transfer_of,
 )
-from tests.reference import recover as reference
+from tests.twins import recover as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.recovery import recover as kernels

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.recover_rig import scene, solve_here  # noqa: F401
-from tests.reference import recover as reference
+from tests.twins import recover as reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.recovery import recover as kernels
 from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell

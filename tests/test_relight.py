@@ -6,9 +6,9 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import constant_environment, shape
-from tests.reference import color as reference_color
-from tests.reference import relight as reference
 from tests.relight_rig import CAMERA, FLOAT_ERROR, HALF_CODE, POINTS, PRIOR, RIM, H, W, noise_frame, point, run, unit
+from tests.twins import color as reference_color
+from tests.twins import relight as reference
 from warp_ar.kernels import color
 from warp_ar.kernels.receiver.receiver import METHODS, READINGS, text_response
 from warp_ar.kernels.structs import DIRECTIONAL, SPHERE

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from tests.reference import sampling as reference
+from tests.twins import sampling as reference
 from warp_ar.kernels import sampling
 
 COUNT = 200_000

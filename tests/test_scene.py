@@ -20,7 +20,7 @@ from warp_ar import scene as sc
 from warp_ar.errors import SceneError, UsageError, WarpArError
 from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_calibration, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.reference import keys as all_keys
+from warp_ar.scene.key_tables import keys as all_keys
 from warp_ar.scene.scene_files import SceneFiles, files_of
 
 CAMERA = """

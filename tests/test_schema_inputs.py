@@ -19,7 +19,7 @@ from tests.viewer_rig import page_scene
 from warp_ar.errors import SceneError, WarpArError
 from warp_ar.farm.jobs import parse_jobs
 from warp_ar.scene import dumps_scene, loads_scene
-from warp_ar.scene.reference import keys
+from warp_ar.scene.key_tables import keys
 from warp_ar.viewer import edits
 from warp_ar.viewer.protocol import PARTS, ProtocolError, parse_text
 

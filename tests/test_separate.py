@@ -7,8 +7,8 @@ import pytest
 
 from tests.error_model import check_error
 from tests.layer_rig import POSES, SIZE, make_frame, make_scene, run
-from tests.reference import color as reference_color
-from tests.reference import expose as reference_expose
+from tests.twins import color as reference_color
+from tests.twins import expose as reference_expose
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.kernels import color

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.reference import latlong
 from tests.rendered_lamp import Array, Desk
+from tests.twins import latlong
 from tests.two_balls import ALBEDO, BALLS, PLACES, TwoBalls, hits, make_scene, material, pose, rms, shares, shown_of
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.stages.quality import PRESETS

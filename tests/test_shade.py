@@ -11,8 +11,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import TEXTURES, constant_environment, records
-from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
+from tests.twins import shade as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.environment.lobes import lobe_texels

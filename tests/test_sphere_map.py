@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from tests import kernel_rig
 from tests.error_model import check_error
 from tests.kernel_rig import records
-from tests.reference import color as reference_color
-from tests.reference import sphere_map as reference
-from tests.reference.latlong import directions
+from tests.twins import color as reference_color
+from tests.twins import sphere_map as reference
+from tests.twins.latlong import directions
 from warp_ar.kernels import color
 from warp_ar.kernels.environment import sphere_map
 from warp_ar.kernels.environment.lobes import lobe_count

@@ -3,7 +3,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.reference import summed_area as reference
+from tests.twins import summed_area as reference
 from warp_ar.kernels import color
 from warp_ar.kernels.color import decode_codes
 from warp_ar.kernels.picture import summed_area

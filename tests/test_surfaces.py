@@ -5,7 +5,7 @@ import pytest
 
 from tests.error_model import check_error
 from tests.layer_rig import POSES, SIZE, TIMES, look_at, make_frame, make_scene, run
-from tests.reference import surfaces as reference
+from tests.twins import surfaces as reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene.geometry import rotation_matrix
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.reference import textures as reference
+from tests.twins import textures as reference
 from warp_ar.kernels.structs import RayScene, Texture
 from warp_ar.kernels.textures import SurfacePoint, sample_texture
 from warp_ar.scene.materials import IDENTITY, TextureUse

@@ -6,8 +6,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import records
-from tests.reference import latlong as latlong_reference
-from tests.reference import unwrap as reference
+from tests.twins import latlong as latlong_reference
+from tests.twins import unwrap as reference
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.environment import fill, unwrap
 from warp_ar.kernels.structs import (

@@ -11,7 +11,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.hard_cases.generators import closed_sphere
 from tests.kernel_rig import records
-from tests.reference import visibility as reference
+from tests.twins import visibility as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin

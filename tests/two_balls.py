@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.reference.probe_weights import weights
 from tests.rendered_lamp import Array, Desk, irradiance, picture, radiance
 from tests.rendered_room import look_at
+from tests.twins.probe_weights import weights
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene import Camera, LambertMaterial, Marker, MirrorMaterial, Object, Pose, Probe, Proxy, Scene
 

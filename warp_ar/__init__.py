@@ -87,7 +87,7 @@ class _Help:
         self.text = text
 
     def __get__(self, instance: object, owner: type[Any]) -> str:
-        from warp_ar.scene.reference import field_docs
+        from warp_ar.scene.key_tables import field_docs
 
         fields = (f"    {name}: {text}" for name, text in field_docs(owner).items() if not name.startswith("_"))
         return "\n".join([self.text, "", "Attributes:", *fields])

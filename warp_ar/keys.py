@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.errors import UsageError, printable
+from warp_ar.scene.key_tables import keys
 from warp_ar.scene.messages import nearest
-from warp_ar.scene.reference import keys
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -16,8 +16,8 @@ from tomlkit.items import Comment, Whitespace
 from warp_ar.errors import SceneError, SinkError, reason
 from warp_ar.files import read_text, write_whole
 from warp_ar.scene.description import SCHEMA, Marker, Scene
+from warp_ar.scene.key_tables import keys
 from warp_ar.scene.reader import loads_scene
-from warp_ar.scene.reference import keys
 
 FIELD_OF_VIEW = 60.0
 """Assumed field of view of an uncalibrated camera, degrees: between a phone's main camera (65 to 70) and a laptop's (50

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from tests.reference import latlong
+from tests.twins import latlong
 
 
 def reflected_angle(theta, distance):

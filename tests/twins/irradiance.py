@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import sph_harm_y
 
-from tests.reference import latlong
+from tests.twins import latlong
 
 COSINE_LOBE = (np.pi, 2 * np.pi / 3, np.pi / 4, 0.0, -np.pi / 24)
 

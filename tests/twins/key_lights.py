@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.reference import latlong
+from tests.twins import latlong
 
 
 def flow(environment):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.reference import summed_area
+from tests.twins import summed_area
 
 KNEE = 250.0
 

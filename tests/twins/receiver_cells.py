@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.reference import environment_shadow
+from tests.twins import environment_shadow
 
 GREY = 0.5
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.reference import summed_area
+from tests.twins import summed_area
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 

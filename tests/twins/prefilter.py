@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.reference import latlong
+from tests.twins import latlong
 
 
 def lobe(cosine, alpha, kind):

@@ -1,4 +1,4 @@
-"""The reference of scene files: every key that the reader knows is listed, and every example is read."""
+"""Key tables of scene files: every key that the reader knows is listed, and every example is read."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from warp_ar.scene import loads_scene
 from warp_ar.scene.description import SCHEMA
 from warp_ar.scene.fields import Field, fields_of
+from warp_ar.scene.key_tables import SECTIONS, Key, as_markdown, keys
 from warp_ar.scene.materials import MATERIALS
-from warp_ar.scene.reference import SECTIONS, Key, as_markdown, keys
 from warp_ar.scene.scene_files import SceneFiles
 from warp_ar.scene.sections import SceneTable, read_value
 

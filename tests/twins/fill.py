@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tests.reference import latlong
-from tests.reference.safe_math import smooth_ramp
+from tests.twins import latlong
+from tests.twins.safe_math import smooth_ramp
 
 
 def _overlap(fine, coarse):

@@ -1,9 +1,9 @@
-"""Float64 twins of the layers of surfaces: from a scene's description, by ``tests.reference.visibility``."""
+"""Float64 twins of the layers of surfaces: from a scene's description, by ``tests.twins.visibility``."""
 
 import cv2
 import numpy as np
 
-from tests.reference.visibility import Body, closest, intersect_sphere
+from tests.twins.visibility import Body, closest, intersect_sphere
 
 
 def directions(camera, pose, offsets=(0.0, 0.0)):

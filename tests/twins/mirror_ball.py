@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tests.reference.visibility import Body, closest
+from tests.twins.visibility import Body, closest
 
 # Off a surface, relative to a scene of decimetres: far above float64's rounding, far below any distance in it.
 OFF = 1e-9

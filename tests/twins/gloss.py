@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.reference.sampling import ggx_distribution
-from tests.reference.visibility import closest
+from tests.twins.sampling import ggx_distribution
+from tests.twins.visibility import closest
 
 
 def schlick(f0, cosine):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.reference import surfaces
+from tests.twins import surfaces
 
 
 def offsets(count):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.reference.visibility import Body, closest
+from tests.twins.visibility import Body, closest
 
 
 def shade_point_light(bodies: list[Body], base, eye, directions, light, intensity):
