@@ -12,7 +12,8 @@ import warp as wp
 from warp_ar.kernels import color
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.structs import Material
-from warp_ar.scene import Pose
+from warp_ar.scene import Pose, Scene
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Pass
 from warp_ar.stages.shared.lighting import shares_kernels
 
@@ -83,6 +84,12 @@ def trace_of(objects: Sequence[dict[str, Any]], proxies: Sequence[dict[str, Any]
     """Kinds of these shapes, as pipelines compile them."""
     kinds = (tuple(sorted({int(one["kind"]) for one in shapes})) for shapes in (objects, proxies))
     found: TraceConfig = as_compiled(TraceConfig(*kinds, **detail))
+    return found
+
+
+def proxies_of(scene: Scene) -> tuple[int, ...]:
+    """Kinds of a scene's proxies, as pipelines compile them."""
+    found: tuple[int, ...] = as_compiled(trace_config(scene)).proxies
     return found
 
 

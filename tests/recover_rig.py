@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from tests.kernel_rig import records
+from tests.kernel_rig import proxies_of, records, trace_of
 from tests.twins import recover as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.recovery import recover as kernels
@@ -16,7 +16,6 @@ from warp_ar.kernels.recovery.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell
 from warp_ar.light import recovery, solving
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.scene import loads_scene
-from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
 
 SCENE = """
@@ -95,10 +94,11 @@ def cells_of(device, radiance=1.0, clipped=0.0):
     return values, wp.array(values, dtype=Cell, device=device)
 
 
-def transfer_of(device, points, cells, probes, scene, proxies=()):
+def transfer_of(device, points, cells, probes, scene):
     out = [wp.zeros((len(points), CELL_ROWS * CELL_COLUMNS), dtype=wp.float32, device=device) for _ in range(2)]
     traced = wp.zeros(len(points), dtype=wp.int32, device=device)
-    kernels.trace_transfer(proxies, points, seen(device, len(points)), cells, probes, scene, traced, *out)
+    kinds = trace_of((), scene.proxies.numpy()).proxies
+    kernels.trace_transfer(kinds, points, seen(device, len(points)), cells, probes, scene, traced, *out)
     return [array.numpy().astype(float) for array in out]
 
 
@@ -108,7 +108,7 @@ class DistantLight:
     def __init__(self, device, scene, *, table=0.4, box=0.3, noise=0.0):
         self.device, self.scene = device, scene
         self.host = HostScene(dataclasses.replace(scene, objects=()), device)
-        self.proxies = trace_config(scene).proxies
+        self.proxies = proxies_of(scene)
         self.surfaces = light_surfaces.find_surfaces(scene)
         records = self.surfaces.points
         self.points = wp.array(records, dtype=kernels.SurfacePoint, device=device)
@@ -133,9 +133,7 @@ class DistantLight:
         down = values["direction"][..., 2] < -0.05
         values["modelled"] = down
         cells = wp.array(values, dtype=Cell, device=self.device)
-        straight, mirrored = transfer_of(
-            self.device, self.points, cells, self.probes, self.host.ray_scene, self.proxies
-        )
+        straight, mirrored = transfer_of(self.device, self.points, cells, self.probes, self.host.ray_scene)
         irradiance = (straight + mirrored) @ radiance + extra
         shown = exposure * self.reflectance[:, None] * irradiance / np.pi
         observed = np.zeros(len(shown), np.dtype(kernels.Observation.numpy_dtype()))

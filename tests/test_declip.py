@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.kernel_rig import trace_of
 from tests.twins import color as reference_color
 from tests.twins import declip as reference
 from warp_ar.kernels import color
@@ -17,7 +18,7 @@ FLOAT = 2e-5
 DISTANCE, RADIUS = 0.5, 0.05
 
 
-def run(frame, config=None, environment=None, params=None, proxies=()):
+def run(frame, by_ball=False, environment=None, params=None, proxies=()):
     frame = np.ascontiguousarray(frame, dtype=np.uint8)
     height, width = frame.shape[:2]
     array = wp.array(frame, dtype=wp.vec3ub)
@@ -38,7 +39,7 @@ def run(frame, config=None, environment=None, params=None, proxies=()):
     declip.pull_frame(active, array, decode, out, levels)
     declip.fill_levels(active, array.shape, levels)
     declip.complete_core(
-        config or declip.DeclipConfig(),
+        declip.DeclipConfig(by_ball, trace_of((), [{"kind": one.kind} for one in proxies]).proxies),
         make_picture(array, None, wp.array(rays(height, width), dtype=wp.vec2)),
         levels,
         wp.array([params or FrameParams()], dtype=FrameParams),
@@ -161,20 +162,17 @@ def environment(height=64, base=0.3, spots=()):
     return out
 
 
-BALL = declip.DeclipConfig(ball=True)
-
-
 def test_ball_pixel_shows_what_it_mirrors(device):
     """The ball's middle mirrors the camera, which stands at -y."""
     frame = np.full((65, 65, 3), 60, np.uint8)
     frame[31:34, 31:34] = 255
     for radiance in (3.0, 30.0):
         surroundings = environment(spots=[(0.5 * np.pi, -0.5 * np.pi, 0.5, radiance)])
-        middle = run(frame, BALL, surroundings, looking_at_ball())[32, 32]
+        middle = run(frame, True, surroundings, looking_at_ball())[32, 32]
         # Two levels up at most: growth of 3/4 toward 0.8 times the radiance.
         assert (middle <= 0.8 * radiance * (1.0 + FLOAT)).all()
         assert (middle >= (0.8 * radiance) ** 0.5).all()
-    assert (run(frame, BALL, environment(), looking_at_ball())[32, 32] == 1.0).all()
+    assert (run(frame, True, environment(), looking_at_ball())[32, 32] == 1.0).all()
 
 
 @pytest.mark.parametrize("pixel", [(32, 34), (30, 32), (33, 30), (34, 33)])
@@ -190,7 +188,7 @@ def test_ball_pixel_off_the_middle_shows_what_it_mirrors(device, pixel):
 
     def lit_from(d):
         surroundings = environment(spots=[(np.arccos(d[2]), np.arctan2(d[1], d[0]), 0.2, 30.0)])
-        return run(frame, BALL, surroundings, looking_at_ball())[pixel]
+        return run(frame, True, surroundings, looking_at_ball())[pixel]
 
     assert (lit_from(mirrored) >= 24.0**0.5).all()
     for elsewhere in (normal, direction, -mirrored):
@@ -205,9 +203,9 @@ def test_lamp_beyond_the_scene_is_found_at_its_distance(device, distance):
     x, y = rays(65, 65)[8, 8]
     point = np.array([0.0, -DISTANCE, 0.0]) + distance * np.array([x, 1.0, -y])
     theta, phi = np.arccos(point[2] / np.linalg.norm(point)), np.arctan2(point[1], point[0])
-    out = run(frame, BALL, environment(spots=[(theta, phi, 0.12, 50.0)]), looking_at_ball())
+    out = run(frame, True, environment(spots=[(theta, phi, 0.12, 50.0)]), looking_at_ball())
     assert out[8, 8].min() > 4.0
-    elsewhere = run(frame, BALL, environment(spots=[(theta, phi + 2.0, 0.12, 50.0)]), looking_at_ball())
+    elsewhere = run(frame, True, environment(spots=[(theta, phi + 2.0, 0.12, 50.0)]), looking_at_ball())
     assert elsewhere[8, 8].max() <= 2.0
 
 
@@ -218,8 +216,8 @@ def test_modelled_surface_is_no_lamp(device):
     wall.kind, wall.scale, wall.extent = PLANE, 1.0, wp.vec3(9.0, 9.0, 0.0)
     wall.rotation, wall.position = wp.mat33(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0), wp.vec3(0.0, 1.0, 0.0)
     bright = environment(base=20.0)
-    assert run(frame, BALL, bright, looking_at_ball())[8, 8].min() > 4.0
-    hidden = run(frame, declip.DeclipConfig(True, (PLANE,)), bright, looking_at_ball(), [wall])
+    assert run(frame, True, bright, looking_at_ball())[8, 8].min() > 4.0
+    hidden = run(frame, True, bright, looking_at_ball(), [wall])
     assert hidden[8, 8].max() <= 2.0
 
 

@@ -3,7 +3,7 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import records
+from tests.kernel_rig import proxies_of, records
 from tests.twins import fill as reference
 from tests.twins import latlong
 from warp_ar.kernels import structs
@@ -11,7 +11,6 @@ from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.environment import fill
 from warp_ar.kernels.environment.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame
 from warp_ar.scene import loads_scene
-from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
 
 # Float32 sums and exponentials, a few roundings each.
@@ -155,7 +154,7 @@ def given(device, frame, text, balls):
         records(structs.Probe, *probes, device=device),
         host.ray_scene,
     )
-    return host, arguments, trace_config(scene).proxies
+    return host, arguments, proxies_of(scene)
 
 
 def filled_fill_frame(device, frame, text, seed, *, balls=((0.0, 0.0, 0.1),), ball=0):

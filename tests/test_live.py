@@ -264,8 +264,7 @@ ONE_PLACE = {
 }
 
 
-@pytest.mark.parametrize("case", ONE_PLACE)
-@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize(("case", "overwrite"), [(case, number % 2 == 0) for number, case in enumerate(ONE_PLACE)])
 def test_nothing_is_written_over_what_is_read_or_twice(
     case: str, overwrite: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

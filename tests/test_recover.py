@@ -10,7 +10,7 @@ import warp as wp
 from scipy.optimize import nnls
 
 from tests.error_model import check_error
-from tests.kernel_rig import records
+from tests.kernel_rig import proxies_of, records, trace_of
 from tests.recover_rig import (  # noqa: F401  # noqa: F401
     DistantLight,
     cells_of,
@@ -41,7 +41,6 @@ from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch, room
 from warp_ar.light.problem import Candidate, Problem, emitter_directions, mirroring_points
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.sources.deep_frame import srgb8
 
@@ -90,10 +89,9 @@ def test_transfer_agrees_with_its_twin(device):
 def test_proxies_send_the_share_to_where_the_ball_sees_them(device, scene):
     """Under a face that looks at the table, all irradiance comes from cells in which the ball sees the table."""
     host = HostScene(dataclasses.replace(scene, objects=()), device)
-    proxies = trace_config(scene).proxies
     points = points_of(device, [(0.0, 0.1, 0.02)], [(0, 0, -1)])
     values, cells = cells_of(device)
-    straight, _ = transfer_of(device, points, cells, probes_of(device), host.ray_scene, proxies)
+    straight, _ = transfer_of(device, points, cells, probes_of(device), host.ray_scene)
     below = values["direction"].reshape(-1, 3)[:, 2] < 0
     assert straight[0].sum() == pytest.approx(np.pi, rel=QUADRATURE)
     assert straight[0][below].sum() == pytest.approx(straight[0].sum(), rel=0.01)
@@ -113,7 +111,7 @@ def test_emitters_fall_off_and_are_shadowed(device):
     points = points_of(device, positions, [(0, 0, 1)] * 3)
     out = wp.zeros((3, 1), dtype=wp.float32, device=device)
     emitters = wp.array([[*emitter, 0.01]], dtype=wp.vec4, device=device)
-    kernels.trace_emitters((), points, seen(device, 3), emitters, probes, host.ray_scene, out)
+    kernels.trace_emitters(trace_of((), ()).proxies, points, seen(device, 3), emitters, probes, host.ray_scene, out)
     got = out.numpy()[:, 0]
     assert got[0] == pytest.approx(1 / 0.335**2, rel=1e-4)
     assert got[1] == pytest.approx(0.335 / (0.335**2 + 0.4**2) ** 1.5, rel=1e-4)
@@ -132,7 +130,7 @@ def test_far_emitters_are_distant_light(device):
     points = points_of(device, positions, [(0, 0, 1)] * 3)
     emitters = wp.array([[*(1e3 * direction), 1e3 * np.sin(angle)]], dtype=wp.vec4, device=device)
     out = wp.zeros((3, 1), dtype=wp.float32, device=device)
-    kernels.trace_emitters((), points, seen(device, 3), emitters, probes, host.ray_scene, out)
+    kernels.trace_emitters(trace_of((), ()).proxies, points, seen(device, 3), emitters, probes, host.ray_scene, out)
     straight, mirrored = transfer_of(device, points, cells, probes, host.ray_scene)
     want = (straight + mirrored)[:, m] / values["solid_angle"].ravel()[m]
     assert out.numpy()[:, 0] * 1e6 == pytest.approx(want, rel=1e-3)
@@ -153,7 +151,7 @@ def test_observation_reads_surfaces_and_nothing_else(device, scene):
     image = np.full((240, 320, 3), 51, np.uint8)
     image[:, 160:, 0] = 255
     host = HostScene(dataclasses.replace(scene, objects=()), device)
-    proxies = trace_config(scene).proxies
+    proxies = proxies_of(scene)
     # Left and right on the table, under the ball, under the box, beyond the frame, and facing away.
     positions = [(-0.1, -0.1, 0), (0.1, -0.1, 0), (-0.12, 0.03, 0), (0.05, 0.2, 0), (2.0, 0, 0), (-0.1, -0.1, 0)]
     points = points_of(device, positions, [(0, 0, 1)] * 5 + [(0, 0, -1)])
@@ -179,11 +177,11 @@ def test_observation_of_a_linear_frame_reads_light_as_it_is(device, scene):
     seen = params, probes_of(device), host.ray_scene, points, out
     clip = wp.array(np.float32([[5.0] * 3, [3.0] * 3]), dtype=wp.vec3, device=device)
     frame = wp.array(light, dtype=wp.vec3, device=device)
-    kernels.observe_surfaces(trace_config(scene).proxies, True, frame, clip, *seen)
+    kernels.observe_surfaces(proxies_of(scene), True, frame, clip, *seen)
     np.testing.assert_allclose(out.numpy()["radiance"], [[0.0021] * 3, [6.0, 3.5, 3.5]], rtol=1e-6)
     # Red is at clipping by itself, the others beside it.
     np.testing.assert_array_equal(out.numpy()["clipped"], [[0.0] * 3, [1.0] * 3])
-    kernels.observe_surfaces(trace_config(scene).proxies, False, codes, table, *seen)
+    kernels.observe_surfaces(proxies_of(scene), False, codes, table, *seen)
     assert abs(out.numpy()["radiance"][0, 0] / 0.0021 - 1.0) > 0.005
     assert out.numpy()["radiance"][1].max() == 1.0
 
@@ -237,7 +235,7 @@ def test_cells_keep_energy_and_recovered_returns_it(device, height, scene):
     weigh_boundaries(arrays[2], *ball_of(device, 40.0), weighed)
     cells = wp.zeros(cell_shape(*shape), dtype=Cell, device=device)
     host = HostScene(dataclasses.replace(scene, objects=()), device)
-    proxies = trace_config(scene).proxies
+    proxies = proxies_of(scene)
     condense_cells(proxies, *arrays, weighed, probes_of(device), host.ray_scene, cells)
     got = cells.numpy()
     area = reference.cell_directions(*shape)[1].reshape(shape)[..., None]
@@ -284,7 +282,7 @@ def test_what_clips_on_a_proxy_beside_light_behind_its_edge_is_left_out(device, 
     assert is_edge.any() == (height > 32)
     left = np.kron(is_edge, np.ones((height // rows, height // rows))).astype(bool) & on
     missing = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
-    host, proxies = HostScene(plane, device), trace_config(plane).proxies
+    host, proxies = HostScene(plane, device), proxies_of(plane)
     source = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
     leave_out_edges(proxies, source, probes_of(device), host.ray_scene, missing)
     assert (missing.numpy() == np.where(left[..., None], 0.0, clipped)).all()

@@ -5,7 +5,7 @@ import trimesh
 import warp as wp
 
 from tests.error_model import check_error
-from tests.kernel_rig import records
+from tests.kernel_rig import records, trace_of
 from tests.twins import latlong as latlong_reference
 from tests.twins import unwrap as reference
 from warp_ar.kernels.color import decode_table
@@ -63,7 +63,7 @@ BALL = (CENTER, RADIUS, REFLECTANCE)
 
 
 def project(view, balls=(BALL,), shapes=(), height=HEIGHT):
-    kinds = tuple(sorted((PLANE, BOX, MESH))) if shapes else ()  # one kernel for all that hide
+    kinds = trace_of((), shapes).proxies
     corners = wp.zeros((height + 1, 2 * height + 1, len(balls)), dtype=wp.vec3)
     rays = wp.array(view.rays().astype(np.float32), dtype=wp.vec2)
     unwrap.project_corners(kinds, make_params(view), make_probes(balls), rays, make_scene(shapes), corners)

@@ -18,13 +18,13 @@ from hypothesis import strategies as st
 
 from tests.hard_cases import atlas, generators
 from tests.hard_cases.rig import LIGHT_RADIUS, POSE, SIZE, Rig, assert_finite, make_scene
+from tests.kernel_rig import proxies_of
 from tests.recover_rig import cells_of, points_of, probes_of, seen, transfer_of
 from tests.test_visibility import World, shoot
 from warp_ar.errors import SceneError
 from warp_ar.kernels.recovery import recover
 from warp_ar.scene import Object, PhongMaterial, Pose, Proxy
 from warp_ar.scene.geometry import Mesh, rotation_matrix
-from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.ray_scene import HostScene
 
@@ -212,7 +212,7 @@ def receive(device, scale, shift):
     middle = scale * np.array([0.0, 0.13, 0.08]) + shift
     box = Proxy("box", at=tuple(middle), size=tuple(2 * scale * half), rotate=turn)
     scene = dataclasses.replace(scene, proxies=(scene.proxies[0], box))
-    host, proxies = HostScene(scene, device), trace_config(scene).proxies
+    host, proxies = HostScene(scene, device), proxies_of(scene)
     # Off the middle of every face of a box that stands askew, so that no coordinate is exact, and on the plane.
     normals = np.concatenate([np.eye(3), -np.eye(3)])
     faces = half * (normals + 0.317 * (normals == 0)) @ rotation_matrix(turn).T
@@ -221,7 +221,7 @@ def receive(device, scale, shift):
     points = points_of(device, places, normals)
     ball = scene.probes[0]
     probes = probes_of(device, ball.center, ball.radius)
-    straight, mirrored = transfer_of(device, points, cells_of(device)[1], probes, host.ray_scene, proxies)
+    straight, mirrored = transfer_of(device, points, cells_of(device)[1], probes, host.ray_scene)
     lamp = scale * np.array([0.03, 0.05, 0.4]) + shift
     out = wp.zeros((len(places), 1), dtype=wp.float32, device=device)
     lamps = wp.array([[*lamp, 0.01 * scale]], dtype=wp.vec4, device=device)
