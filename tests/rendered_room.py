@@ -7,10 +7,14 @@ walls shift as they do in a real room. The table scatters the room's irradiance;
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+
+from warp_ar.calibration.card import PAPERS, draw_card
+from warp_ar.tracking import card_layout
 
 Array = NDArray[np.float64]
 
@@ -30,6 +34,8 @@ class Room:
     lamp: float = 40.0
     window: float = 6.0
     wall: float = 0.5
+    card: bool = False
+    """The printed card on the table, with the ball on its cross."""
 
     @property
     def center(self) -> Array:
@@ -86,7 +92,11 @@ def _scene_radiance(room: Room, origin: Array, direction: Array, irradiance: Arr
     )
     near = np.hypot(p[:, 0], p[:, 1]) / room.radius
     open_sky = 1.0 - 0.7 / (1.0 + near**2)
-    table = (wood * open_sky)[:, None] * np.array([0.9, 0.65, 0.45]) * irradiance / math.pi
+    paint = wood[:, None] * np.array([0.9, 0.65, 0.45])
+    if room.card:
+        card = _card_reflectance(np.where(on[:, None], p, 1e3))
+        paint = np.where(np.isnan(card)[:, None], paint, card[:, None])
+    table = paint * open_sky[:, None] * irradiance / math.pi
     out = np.where(on[:, None], table, out)
     if room.lift > 0.0:
         # A cylinder, half as wide as the ball.
@@ -100,6 +110,23 @@ def _scene_radiance(room: Room, origin: Array, direction: Array, irradiance: Arr
         hit = (disc > 0) & (s > 1e-9) & (z > 0) & (z < room.lift + 0.3 * room.radius)
         out = np.where(hit[:, None], 0.03 * irradiance / math.pi, out)
     return out
+
+
+@functools.cache
+def _sheet(per_metre: int = 4000) -> tuple[NDArray[np.uint8], int]:
+    """The card's print, 255 where it is white, and pixels per metre."""
+    size = tuple(length / 1e3 for length in PAPERS["a4"])
+    return card_layout.draw_sheet(size, per_metre, draw_card(card_layout.SHEET, per_metre)), per_metre
+
+
+def _card_reflectance(p: Array) -> Array:
+    """Reflectance of the card at points of the table, NaN beside it; its board lies before the ball."""
+    page, scale = _sheet()
+    middle = np.array([page.shape[1] / 2, scale * card_layout.board_top(page.shape[0] / scale)])
+    x, y = np.moveaxis(middle + scale * (p[..., :2] + card_layout.BALL_PLACE) * (1, -1), -1, 0)
+    on = (x >= 0) & (x < page.shape[1]) & (y >= 0) & (y < page.shape[0])
+    ink = page[np.where(on, y, 0).astype(int), np.where(on, x, 0).astype(int)]
+    return np.where(on, 0.05 + 0.8 * ink / 255.0, np.nan)
 
 
 def table_irradiance(room: Room, count: int = 4096) -> Array:

@@ -234,3 +234,10 @@ def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(brac
     said = capsys.readouterr().err
     assert "is a file, not a folder to write to" in said
     assert said.count("\n") == 1
+
+
+def test_a_scene_needs_a_plane(bracket, tmp_path, capsys):
+    files = ["--output", str(tmp_path / "light.exr"), "--scene", str(tmp_path / "photo.toml"), "--device", "cpu"]
+    assert main([str(bracket[1]), *files]) == EXIT_USAGE
+    assert "photo.toml needs the plane: give --rectangle and --rectangle-size, or --contact" in capsys.readouterr().err
+    assert not (tmp_path / "light.exr").exists()

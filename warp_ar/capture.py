@@ -101,8 +101,6 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError("--rectangle and --rectangle-size belong together: pixels of the corners, metres of the sides")
     if options.rectangle is not None and options.contact is not None:
         raise UsageError("--rectangle and --contact both define the plane; give one of the two")
-    if options.scene is not None and options.rectangle is None and options.contact is None:
-        raise UsageError("--scene needs the plane: give --rectangle and --rectangle-size, or --contact")
     if options.ball is not None and options.circle is not None:
         raise UsageError("--ball is a rough circle and --circle an exact one; give one of the two")
     if options.shown is not None and options.shown not in options.photos:
@@ -176,6 +174,9 @@ def capture(options: argparse.Namespace) -> int:
     )
     for note in found.notes:
         say(note)
+    if options.scene is not None and found.support is None:
+        right = "give --rectangle and --rectangle-size, or --contact, or show the printed card"
+        raise UsageError(f"--scene {options.scene} needs the plane: {right}")
     found.light.save(options.output, options.axes)
     emitters = counted(len(found.light.emitters), "emitter")
     print(f"{options.output}: light in camera values of {found.shown.name}, {emitters}")

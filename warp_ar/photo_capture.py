@@ -25,7 +25,7 @@ from warp_ar.light.captured import Light, find_emitters, irradiance_above, texel
 from warp_ar.light.priors import least_missing
 from warp_ar.photographs.bracket import Aligned, Circle, agree_exposures, align, thin_exposures
 from warp_ar.photographs.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
-from warp_ar.photographs.support import Support
+from warp_ar.photographs.support import Support, card_points, plane_from_points
 from warp_ar.photographs.table_seen import WHITEST, Table
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
@@ -74,7 +74,7 @@ class Capture:
     picture: Image
     """Pixels of the shown photograph, uint8 RGB, upright."""
     support: Support | None
-    """Plane that the ball stands on; None without ``support``."""
+    """Plane that the ball stands on; None if neither ``support`` nor the printed card gives it."""
     notes: tuple[str, ...]
     """Notes for the user, one string per line."""
     response: Array | None = None
@@ -109,8 +109,8 @@ def capture_light(
         shown: Index of the photograph whose camera values the light uses; None: the one with the best exposed ball.
         transfer: Camera response that is tried first.
         focal_35mm: Focal length of the picture as it is, in millimetres for a full frame; None: from EXIF.
-        support: Function that finds the plane that the ball stands on. The light uses the plane's axes; None: the axes
-            of a level camera.
+        support: Function that finds the plane that the ball stands on. The light uses the plane's axes; None: the
+            plane and axes of the printed card if the shown photograph has it, else the axes of a level camera.
         reflectance: Reflectance of the ball; None: measured by its reflection of the support's plane, else ``GUESS``.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         height: Rows of the map; None: chosen by the ball's size in pixels.
@@ -148,13 +148,17 @@ def capture_light(
         )
     if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
         notes.append("the ball's picture shows no reflections: is a ball there, uncovered and polished?")
-    found = None if support is None else support(outline, camera)
-    turn = np.array(pose_of_position((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0]).reshape(3, 3)
-    if found is not None:
-        turn = found.pose.rotation
+    found = None
+    if support is not None:
+        found = support(outline, camera)
         notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
+    elif (card := card_points(reference.image)) is not None:
+        found = plane_from_points(camera, *card)
+        notes.append(f"the plane is the printed card's, whose corners are off by {found.error:.1f} pixels")
+    turn = np.array(pose_of_position((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0]).reshape(3, 3)
     table = None
     if found is not None:
+        turn = found.pose.rotation
         codes = decode_table(transfer) if bracket.curve is None else bracket.curve.astype(np.float32)
         table = Table.under(outline, reference.image, camera, found, codes)
     mirrored, note = _ball_reflectance(table, reflectance)

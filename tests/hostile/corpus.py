@@ -188,6 +188,10 @@ def _binary_poses(path: pathlib.Path) -> None:
     path.write_bytes(struct.pack("<Q", 2) + 2 * (image + b"a.png\0" + struct.pack("<Q2dq", 1, 10.0, 20.0, -1)))
 
 
+def _binary_cameras(path: pathlib.Path) -> None:
+    path.write_bytes(struct.pack("<QIiQQ4d", 1, 1, 1, 64, 48, 60.0, 60.0, 32.0, 24.0))
+
+
 def _jobs(path: pathlib.Path) -> None:
     clip = '[[clip]]\nscene = "desk"\nframes = [0, 30]\n'
     path.write_text(f'schema = 1\n[run]\nquality = "low"\nsegment_frames = 20\n{clip}')
@@ -284,6 +288,7 @@ READERS = (
     Reader("poses, JSON", "poses.json", load_pose_file, _poses),
     Reader("poses, COLMAP", "images.txt", load_pose_file, _poses),
     Reader("poses, COLMAP's binary", "images.bin", load_pose_file, _binary_poses),
+    Reader("calibration, COLMAP's binary", "cameras.bin", load_calibration, _binary_cameras),
     Reader("poses, OpenTrackIO", "track.jsonl", load_pose_file, _track),
     Reader("poses, USD", "shot.usda", load_pose_file, lambda path: write_usd(path, _shot())),
     Reader("farm's jobs, TOML", "jobs.toml", lambda path: parse_jobs(read_jobs(path), str(path)), _jobs),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -24,9 +24,19 @@ from warp_ar.scene import (
     Scene,
     SourceSpec,
 )
-from warp_ar.scene.pixel_rays import undistorted
+from warp_ar.scene.calibration_file import load_calibration
+from warp_ar.scene.pixel_rays import project, undistorted
+from warp_ar.scene.pose_file import load_pose_file
+from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.markers import MarkerDetector, pattern_of
 
 Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+MODEL = "cameras", "images"
+"""Files of a COLMAP model that are read, without suffix."""
+FEWEST_MARKERS = 3
+"""Smallest number of the printed card's markers that count as the card: clutter resembles single ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +60,23 @@ class Support:
         return max(float(up @ self.pose.translation / (up @ np.array(sphere) - 1.0)), 1e-3)
 
 
-def plane_from_points(camera: Camera, points: Sequence[Sequence[float]], pixels: Sequence[Sequence[float]]) -> Support:
+def card_points(image: Image) -> tuple[Array, Array] | None:
+    """Return corners of the printed card's markers, (n, 3) metres, and their pixels, (n, 2).
+
+    The origin is the middle of the card's board: x right, y up the page, z out of it. Return None if fewer than
+    ``FEWEST_MARKERS`` of its markers are visible.
+    """
+    known = pattern_of(SHEET).markers
+    seen = MarkerDetector(SHEET.dictionary).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    found = {one.id: one.corners for one in seen if one.id in known}
+    if len(found) < FEWEST_MARKERS:
+        return None
+    return np.concatenate([known[number] for number in found]), np.concatenate(list(found.values())).astype(float)
+
+
+def plane_from_points(
+    camera: Camera, points: Sequence[Sequence[float]] | Array, pixels: Sequence[Sequence[float]] | Array
+) -> Support:
     """Return the plane z = 0 and the camera's pose from the pixels of known points.
 
     Args:
@@ -62,29 +88,127 @@ def plane_from_points(camera: Camera, points: Sequence[Sequence[float]], pixels:
         UsageError: No camera pose explains the pixels.
     """
     world, seen = np.array(points, float), np.array(pixels, float)
-    matrix, bent = camera.matrix(), np.array(camera.distortion)
-    found, turn, translation = cv2.solvePnP(world, seen, matrix, bent, flags=cv2.SOLVEPNP_SQPNP)
+    lens = camera.matrix(), np.array(camera.distortion)
+    found, turn, translation = cv2.solvePnP(world, seen, *lens, flags=cv2.SOLVEPNP_SQPNP)
     if not found:
         raise UsageError("no camera sees these points at these pixels; is one of them mistaken?")
-    turn, translation = cv2.solvePnPRefineLM(world, seen, matrix, bent, turn, translation)
-    off = cv2.projectPoints(world, turn, translation, matrix, bent)[0][:, 0] - seen
+    turn, translation = cv2.solvePnPRefineLM(world, seen, *lens, turn, translation)
     pose = Pose(cv2.Rodrigues(turn)[0], translation.ravel())
+    off = project(camera, pose.apply(world)) - seen
     return Support(pose, math.nan, float(np.sqrt((off**2).sum(1).mean())))
 
 
-def focal_range(camera: Camera, find: Callable[[Camera], Support], picked: float = 1.0) -> tuple[Camera, float, float]:
+def focal_range(
+    camera: Camera, find: Callable[[Camera], Support], count: int = 4, picked: float = 1.0
+) -> tuple[Camera, float, float]:
     """Return a camera with the best focal length for selected points, and the smallest and largest that still fit.
 
     Args:
         camera: Camera whose focal length is unknown.
         find: Function from a camera to the plane.
-        picked: Increase of the error in pixels, above the best one, that still fits.
+        count: Number of points.
+        picked: Standard deviation of a point in pixels. A length fits if it adds at most 4 ``picked``^2 to the sum of
+            squared errors, which are two standard deviations.
+
+    Raises:
+        UsageError: No focal length explains the points.
     """
     lengths = math.hypot(camera.width, camera.height) * np.geomspace(0.4, 8.0, 121)
     tried = [dataclasses.replace(camera, fx=float(f), fy=float(f)) for f in lengths]
-    errors = np.array([find(one).error for one in tried])
-    fits = lengths[errors <= errors.min() + picked]
-    return tried[int(errors.argmin())], float(fits.min()), float(fits.max())
+    squares, problem = np.full(len(tried), np.inf), None
+    for k, one in enumerate(tried):
+        try:
+            squares[k] = find(one).error ** 2
+        except UsageError as error:
+            problem = error
+    best = int(squares.argmin())
+    if problem is not None and np.isinf(squares[best]):
+        raise problem
+    fits = lengths[squares <= squares[best] + 4.0 * picked**2 / count]
+    around = squares[best - 1 : best + 2]
+    if len(around) == 3 and np.isfinite(around).all() and (bend := around[0] - 2.0 * around[1] + around[2]) > 0.0:
+        # The vertex of the parabola through the best three.
+        focal = lengths[best] * (lengths[1] / lengths[0]) ** (0.5 * (around[0] - around[2]) / bend)
+        return dataclasses.replace(camera, fx=float(focal), fy=float(focal)), float(fits.min()), float(fits.max())
+    return tried[best], float(fits.min()), float(fits.max())
+
+
+def plane_from_vanishing(
+    camera: Camera, lines: Mapping[str, Sequence[Sequence[float]]], length: Sequence[float]
+) -> Support:
+    """Return the plane z = 0 and the camera's pose from parallel segments along two or three of the world's axes.
+
+    The planes through the camera and the segments of one axis share that axis as a line: with the planes' normals n_i,
+    its direction d minimises sum (n_i . d)^2. The rotation is the nearest to the directions of all axes.
+
+    Args:
+        camera: The camera.
+        lines: By axis ("x", "y" or "z"), two or more segments: column and row of both ends. The first segments of x and
+            y run in the axis's direction; z points up, and y turns about where that makes the axes right-handed.
+        length: Columns and rows of two points on the plane z = 0, of which the first is the origin, and their distance
+            in metres.
+
+    Raises:
+        UsageError: A point of ``length`` lies above the plane's horizon.
+    """
+
+    def rays(pixels: Sequence[Sequence[float]] | Array) -> Array:
+        flat = undistorted(camera, np.reshape(pixels, (-1, 2)))
+        return np.column_stack([flat, np.ones(len(flat))])
+
+    ends = {"xyz".index(axis): rays(segments).reshape(-1, 2, 3) for axis, segments in lines.items()}
+    first, second = rays(np.reshape(length[:4], (2, 2)))
+    ways = np.zeros((3, 3))
+    for axis, pairs in ends.items():
+        normals = np.cross(pairs[:, 0], pairs[:, 1])
+        way = np.linalg.svd(normals / np.linalg.norm(normals, axis=1, keepdims=True))[2][-1]
+        from_, to = pairs[0]
+        ahead = -way @ first if axis == 2 else (to - from_) @ (way - way[2] * from_)
+        ways[:, axis] = way * np.sign(ahead)
+    for axis in {0, 1, 2} - set(ends):
+        ways[:, axis] = np.cross(ways[:, axis - 2], ways[:, axis - 1])
+    ways[:, 2] *= -np.sign(ways[:, 2] @ first)
+    if np.linalg.det(ways) < 0.0:
+        ways[:, 1] *= -1.0
+    left, _, right = np.linalg.svd(ways)
+    rotation = left @ right
+    off = []
+    for axis, pairs in ends.items():
+        through = np.cross(pairs.mean(1), rotation[:, axis])
+        off.append((pairs @ through[..., None])[..., 0] / np.linalg.norm(through[:, :2], axis=1, keepdims=True))
+    down = np.array([first, second]) @ -rotation[:, 2]
+    if down.min() <= 1e-6:
+        raise UsageError(f"--length {' '.join(f'{value:g}' for value in length)}: expected points below the horizon")
+    # Both points on the plane one metre below the camera.
+    near, far = first / down[0], second / down[1]
+    error = camera.fx * math.sqrt(float(np.mean(np.concatenate(off) ** 2)))
+    return Support(Pose(rotation, length[4] / float(np.linalg.norm(near - far)) * near), math.nan, error)
+
+
+def plane_from_colmap(folder: Path, photograph: Path, scale: float) -> tuple[Camera, Support]:
+    """Return the camera of a photograph in a COLMAP model, and the plane z = 0 of the model with the camera's pose.
+
+    Args:
+        folder: Folder with cameras and images, both ``.txt`` or both ``.bin``.
+        photograph: The photograph, which the model has by its name.
+        scale: Metres per unit of the model.
+
+    Raises:
+        UsageError: The model is not there, or does not have the photograph.
+        SceneError: A file of the model cannot be used.
+    """
+    ends = [end for end in (".bin", ".txt") if all((folder / f"{name}{end}").is_file() for name in MODEL)]
+    if not ends:
+        right = "expected the folder of a sparse model, with cameras and images as .txt or .bin"
+        raise UsageError(f"--colmap {folder}: {right}")
+    cameras, images = (folder / f"{name}{ends[0]}" for name in MODEL)
+    poses = load_pose_file(images)
+    place = poses.index_of(photograph.as_posix())
+    if place is None:
+        raise UsageError(f"{images}: expected one picture of the name {photograph.name} among {len(poses.names)}")
+    rotation, translation = poses.poses[place]
+    pose = Pose(np.reshape(rotation, (3, 3)), scale * np.array(translation))
+    return load_calibration(cameras, number=poses.cameras[place]), Support(pose, math.nan, 0.0)
 
 
 def scene_on(

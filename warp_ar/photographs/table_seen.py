@@ -23,6 +23,8 @@ from warp_ar.ball.ball_reflectance import Reflected, are_seen, measure_reflectan
 from warp_ar.photographs.support import Support
 from warp_ar.scene import Camera, Probe, Proxy, Scene
 from warp_ar.scene.pixel_rays import project
+from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.markers import printed_cells
 
 Array = NDArray[np.float64]
 
@@ -33,6 +35,8 @@ REACH: Final = (2.0, 6.0)
 SHARE: Final = 90.0
 """Percentile of the table's radiance that counts as its brightest part without shadows; above it are specular
 reflections."""
+CLIPPED: Final = 250
+"""Code from which paper counts as clipped."""
 FEWEST: Final = 40
 """Smallest number of visible points of the table."""
 
@@ -89,3 +93,27 @@ class Table:
         linear = cv2.GaussianBlur(cv2.LUT(self.image, self.table[None]), (0, 0), 1.5)
         seen = cv2.remap(linear, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR).mean((1, 2))
         return float(np.pi * np.percentile(seen, SHARE) / irradiance.mean())
+
+
+def exposure_by_paper(
+    image: NDArray[np.uint8], camera: Camera, support: Support, table: NDArray[np.float32], irradiance: Array
+) -> float | None:
+    """Return a photograph's exposure over that of a light, by the printed card's white paper under that light.
+
+    Args:
+        image: uint8 RGB, upright.
+        camera: Camera of the photograph.
+        support: The card's plane.
+        table: Linear value of each code, (256, 3).
+        irradiance: Irradiance of the card by the light, (3,).
+
+    Returns:
+        Ratio of the exposures; None if the paper clips or is not visible.
+    """
+    cells, white, *_ = printed_cells(SHEET)
+    at = project(camera, support.pose.apply(cells[white])).astype(np.float32)
+    codes = np.median(cv2.remap(image, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0], 0)
+    if codes.max() >= CLIPPED or codes.min() < 1.0:
+        return None
+    seen = np.mean([np.interp(code, np.arange(256), table[:, channel]) for channel, code in enumerate(codes)])
+    return float(np.pi * seen / (SHEET.white * irradiance.mean()))

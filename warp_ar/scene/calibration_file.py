@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.files import bracket_depth, check_depth, indentation_depth, is_file, read_text, tag_depth
+from warp_ar.files import bracket_depth, check_depth, indentation_depth, is_file, read_bytes, read_text, tag_depth
 from warp_ar.scene.description import Camera
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, show_value
 
@@ -43,14 +44,15 @@ _COLMAP: Final = {
     "SIMPLE_PINHOLE": "fl_x cx cy",
     "PINHOLE": "fl_x fl_y cx cy",
     "SIMPLE_RADIAL": "fl_x cx cy k1",
-    "SIMPLE_RADIAL_FISHEYE": "fl_x cx cy k1",
     "RADIAL": "fl_x cx cy k1 k2",
-    "RADIAL_FISHEYE": "fl_x cx cy k1 k2",
     "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": "fl_x fl_y cx cy omega",
+    "SIMPLE_RADIAL_FISHEYE": "fl_x cx cy k1",
+    "RADIAL_FISHEYE": "fl_x cx cy k1 k2",
 }
-"""Parameters of COLMAP's camera models, in the order of its files."""
+"""Parameters of COLMAP's camera models in the order of its files; models in the order of their numbers from 0."""
 WIDEST: Final = 80.0
 """Largest angle from the axis, degrees, up to which a fisheye lens is converted; a pinhole's rays end at 90."""
 FISHEYE_ERROR: Final = 0.25
@@ -58,8 +60,8 @@ FISHEYE_ERROR: Final = 0.25
 _EXPECTED: Final = "OpenCV's YAML, JSON or XML"
 
 
-def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
-    """Read a calibration file: OpenCV's YAML, JSON or XML, ROS's camera_info, Kalibr's camchain, COLMAP's cameras.txt.
+def load_calibration(path: str | Path, transfer: str | Path = "srgb", number: str | None = None) -> Camera:
+    """Read a calibration file: OpenCV's YAML, JSON or XML, ROS's camera_info, Kalibr's camchain, COLMAP's cameras.
 
     Follows:
         size; camera matrix, or fx fy cx cy; distortion of 4, 5 or 8 terms; keys of OpenCV, ROS, Kalibr, ArUco, NeRF,
@@ -68,6 +70,7 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
     Args:
         path: The file.
         transfer: Encoding of the camera's values, because calibration files do not state it.
+        number: Number of the camera in a COLMAP model; None: its only one.
 
     Raises:
         SceneError: Damaged; missing keys; several cameras; skew; other models; other keys of distortion; cameras of
@@ -76,7 +79,7 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
     path = Path(path)
     if not is_file(path):
         raise SceneError(f"{path}: no such calibration file")
-    said = _read_tree(path)
+    said = _read_tree(path, number)
     tree = {_plain_key(key): value for key, value in said.items()}
 
     def numbers(*names: str) -> list[float] | None:
@@ -221,20 +224,41 @@ def rational_of_fisheye(
     return k1, k2, 0.0, 0.0, k3, k4, k5, k6
 
 
-def _read_tree(path: Path) -> dict[str, Any]:
+def _colmap_text(path: Path) -> str:
+    """Return COLMAP's ``cameras.bin`` in the form of ``cameras.txt``."""
+    data = read_bytes(path, "text_bytes", SceneError)
+    lines, at, models = [], 8, list(_COLMAP.items())
+    try:
+        for _ in range(struct.unpack_from("<Q", data)[0]):
+            number, model, *size = struct.unpack_from("<IiQQ", data, at)
+            if not 0 <= model < len(models):
+                raise SceneError(f"{path}: camera model {model} is not understood; expected {', '.join(_COLMAP)}")
+            name, terms = models[model]
+            values = struct.unpack_from(f"<{len(terms.split())}d", data, at + 24)
+            at += 24 + 8 * len(values)
+            lines.append(" ".join(map(str, (number, name, *size, *values))))
+    except struct.error as error:
+        raise SceneError(f"{path}: cut off after {len(data):,} bytes, or no cameras.bin of COLMAP") from error
+    return "\n".join(lines)
+
+
+def _read_tree(path: Path, number: str | None) -> dict[str, Any]:
     """Return the keys and values of a calibration file as numbers, texts, lists and maps."""
-    text = read_text(path, SceneError, expected=_EXPECTED)
+    binary = path.suffix.lower() == ".bin"
+    text = _colmap_text(path) if binary else read_text(path, SceneError, expected=_EXPECTED)
     cameras: dict[str, Any] = {}
-    for line in text.splitlines() if path.suffix.lower() == ".txt" else ():
+    for line in text.splitlines() if binary or path.suffix.lower() == ".txt" else ():
         words = line.split()
-        if len(words) < 5 or not re.fullmatch("[A-Z][A-Z_]+", words[1]):
+        if len(words) < 5 or not re.fullmatch("[A-Z][A-Z_]+", words[1]) or number not in (None, words[0]):
             continue
         names = ["width", "height", *_COLMAP.get(words[1], "").split()]
         try:
             values = dict(zip(names, map(float, words[2:]), strict=words[1] in _COLMAP))
         except ValueError as error:
             raise SceneError(f"{path}: {line.strip()[:80]!r}: expected numbers for {', '.join(names)}") from error
-        cameras[f"camera {len(cameras)}"] = {"camera_model": words[1], **values}
+        cameras[f"camera {words[0]}"] = {"camera_model": words[1], **values}
+    if (binary or number is not None) and not cameras:
+        raise SceneError(f"{path}: holds no camera {number or '1'} of COLMAP")
     tree = cameras or _by_opencv(path, text)
     inner = [key for key, value in tree.items() if isinstance(value, dict) and "data" not in value]
     if len(inner) == len(tree) > 1:

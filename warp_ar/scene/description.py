@@ -635,6 +635,8 @@ class PoseSpec:
     """File that the poses were read from."""
     names: tuple[str, ...] = ()
     """File names of the pictures that the poses belong to; empty if the file has no names."""
+    cameras: tuple[str, ...] = ()
+    """Number of each pose's camera in a COLMAP model; empty in other files."""
 
     def __post_init__(self) -> None:
         """Check that all numbers are finite."""
@@ -650,7 +652,7 @@ class PoseSpec:
             found.setdefault(name.stem, []).append(index)
         return found
 
-    def _index_of(self, name: str) -> int | None:
+    def index_of(self, name: str) -> int | None:
         """Return the index of the pose whose name shares the most trailing path components with a picture's path.
 
         Return None if no pose, or more than one, fits best.
@@ -676,7 +678,7 @@ class PoseSpec:
             name: Path of the frame's picture.
         """
         if name and self.names:
-            place = self._index_of(name)
+            place = self.index_of(name)
         else:
             place = 0 if len(self.poses) == 1 else index if index < len(self.poses) else None
         if place is None:

@@ -26,6 +26,8 @@ from warp_ar.scene.messages import is_number
 
 RawPose = tuple[tuple[float, ...], Vec3]
 """``camera_from_world`` with OpenCV's axes: R as 9 numbers row by row, and t in metres."""
+Named = list[tuple[str, RawPose, str]]
+"""Poses, each after its picture's name and before its camera's number in a COLMAP model; both may be empty."""
 Matrix = npt.NDArray[np.float64]
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -101,7 +103,7 @@ def load_pose_file(path: Path) -> PoseSpec:
     if suffix == ".abc":
         raise SceneError(f"{path}: Alembic is not read; turn it into USD, as docs/formats.md shows for Blender")
     if suffix in USD_SUFFIXES:
-        found = [("", pose) for pose in read_usd(path)]
+        found: Named = [("", pose, "") for pose in read_usd(path)]
     elif suffix == ".bin":
         found = _read_colmap_binary(path)
     else:
@@ -109,18 +111,20 @@ def load_pose_file(path: Path) -> PoseSpec:
         if suffix == ".jsonl":
             lines = (line for line in text.splitlines() if line.strip())
             samples = [parse_json(line, str(path), SceneError) for line in lines]
-            found = [("", pose) for pose in read_track(path, samples)]
+            found = [("", pose, "") for pose in read_track(path, samples)]
         else:
-            found = _read_json(path, text) if suffix == ".json" else _read_colmap(path, text)
+            by_json = suffix == ".json"
+            found = [(*one, "") for one in _read_json(path, text)] if by_json else _read_colmap(path, text)
     if not found:
         raise SceneError(f"{path}: holds no pose; expected COLMAP's images, OpenTrackIO samples, or a list of R and t")
-    found = [(name.replace("\\", "/"), pose) for name, pose in found]
-    named = sum(1 for name, _ in found if name)
+    found = [(name.replace("\\", "/"), pose, camera) for name, pose, camera in found]
+    named = sum(1 for name, *_ in found if name)
     if named not in (0, len(found)):
         raise SceneError(f"{path}: {named} of {len(found)} poses have names of pictures; expected all, or none")
     if named:
         found.sort(key=lambda item: natural_key(item[0]))
-    return PoseSpec(tuple(pose for _, pose in found), path, tuple(name for name, _ in found) if named else ())
+    names, poses, cameras = zip(*found, strict=True)
+    return PoseSpec(poses, path, names if named else (), cameras if any(cameras) else ())
 
 
 def _read_json(path: Path, text: str) -> list[tuple[str, RawPose]]:
@@ -182,9 +186,12 @@ def _colmap_pose(label: str, numbers: Sequence[float]) -> RawPose:
     return rotation_of_quaternion(w, x, y, z), (shift[0], shift[1], shift[2])
 
 
-def _read_colmap(path: Path, text: str) -> list[tuple[str, RawPose]]:
-    """Return names and poses of lines ``ID QW QX QY QZ TX TY TZ CAMERA NAME``; a line of 2D points may follow each."""
-    found: list[tuple[str, RawPose]] = []
+def _read_colmap(path: Path, text: str) -> Named:
+    """Return names, poses and cameras of lines ``ID QW QX QY QZ TX TY TZ CAMERA NAME``.
+
+    A line of 2D points may follow each.
+    """
+    found: Named = []
     of_points = False
     for line in text.splitlines():
         words = line.split(maxsplit=9)
@@ -197,28 +204,28 @@ def _read_colmap(path: Path, text: str) -> list[tuple[str, RawPose]]:
         label = f"{path}: image {len(found)}"
         if not named or not all(map(is_number, words[:9])):
             raise SceneError(f"{label}: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, as COLMAP writes")
-        found.append((words[9], _colmap_pose(label, [float(word) for word in words[1:8]])))
+        found.append((words[9], _colmap_pose(label, [float(word) for word in words[1:8]]), words[8]))
         of_points = True
     return found
 
 
-def _read_colmap_binary(path: Path) -> list[tuple[str, RawPose]]:
-    """Return names and poses of COLMAP's ``images.bin``."""
+def _read_colmap_binary(path: Path) -> Named:
+    """Return names, poses and cameras of COLMAP's ``images.bin``."""
     data = read_bytes(path, "mesh_bytes", SceneError)
-    found: list[tuple[str, tuple[float, ...]]] = []
+    found: list[tuple[str, list[float], str]] = []
     try:
         (count,), at = struct.unpack_from("<Q", data), 8
         if count > limits().mesh_elements:
             raise SceneError(too_much(str(path), count, "images", "mesh_elements"))
         for _ in range(count):
-            numbers = struct.unpack_from("<7d", data, at + 4)
+            *numbers, camera = struct.unpack_from("<7dI", data, at + 4)
             end = data.index(b"\0", at + 64)
-            found.append((data[at + 64 : end].decode("utf-8", "replace"), numbers))
+            found.append((data[at + 64 : end].decode("utf-8", "replace"), numbers, str(camera)))
             (points,) = struct.unpack_from("<Q", data, end + 1)
             at = end + 9 + 24 * points
     except (struct.error, ValueError, OverflowError) as error:  # overflow: a count larger than any file
         raise SceneError(f"{path}: cut off after {len(data):,} bytes, or no images.bin of COLMAP") from error
-    return [(name, _colmap_pose(f"{path}: image {name!r}", numbers)) for name, numbers in found]
+    return [(name, _colmap_pose(f"{path}: image {name!r}", numbers), camera) for name, numbers, camera in found]
 
 
 def read_track(path: Path, samples: Sequence[Any]) -> tuple[RawPose, ...]:
