@@ -54,7 +54,6 @@ class FrameParams:
     exposure_scale: wp.float32
     time: wp.float32  # seconds since the first frame
     time_step: wp.float32  # seconds since the previous frame
-    frame_index: wp.int32
     environment_reset: wp.int32  # 1: forget the accumulated environment
     # Rectangles of pixels: row_start, row_stop, col_start, col_stop.
     object_rect: wp.vec4i  # bounds the virtual objects

@@ -18,7 +18,7 @@ from warp_ar.kernels.environment import environment_samples
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, SampleSets
 from warp_ar.kernels.objects.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.receiver import environment_shadow, environment_shadow_filter
-from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue, shaded_shape
+from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue
 from warp_ar.kernels.structs import (
     LAMBERT,
     MESH,
@@ -83,20 +83,12 @@ def sphere(center, radius):
     return shape(SPHERE, center, (radius, 0, 0))
 
 
-def shadow_cells(shape, stride=1, *, like=None, notes=True):
-    """Cells with nothing in them yet, or with the estimates of others."""
+def shadow_cells(shape, stride=1):
+    """Cells with nothing in them yet."""
     cells = ShadowCells()
     cells.stride = stride
-    cells.ratio, cells.bounced, cells.surface = (
-        (wp.zeros(shape, wp.vec4), wp.zeros(shape, wp.vec3), wp.full(shape, 7, wp.int32))
-        if like is None
-        else (like.ratio, like.bounced, like.surface)
-    )
-    cells.filtered = wp.zeros(shape, wp.vec3)
-    if notes:
-        tiles = shaded_shape(*shape)
-        cells.shaded = wp.full(tiles, -1, dtype=wp.int32) if like is None else like.shaded
-        cells.changed = wp.full(tiles, -1, dtype=wp.int32)
+    cells.ratio, cells.bounced = wp.zeros(shape, wp.vec4), wp.zeros(shape, wp.vec3)
+    cells.surface, cells.filtered = wp.full(shape, 7, wp.int32), wp.zeros(shape, wp.vec3)
     return cells
 
 
@@ -161,15 +153,9 @@ def run(
         environment_shadow.shade_by_queue(config, *given, cells, queue)
     if not filtered:
         return cells.ratio.numpy()[..., :3], cells.surface.numpy()
-    # Around cells that are not shaded nothing is averaged, and tiles in which no cell differs from 1 are passed by.
-    every, skipped = shadow_cells(shape, stride, like=cells, notes=False), shadow_cells(shape, stride, like=cells)
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    passed = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
-    for some, target in ((every, out), (skipped, passed)):
-        environment_shadow_filter.filter_ratio(config, params, some, rows=rows)
-        environment_shadow_filter.spread_ratio(config, params, rays, scene, surroundings.probes, some, target)
-    np.testing.assert_array_equal(skipped.filtered.numpy(), every.filtered.numpy())
-    np.testing.assert_array_equal(passed.numpy(), out.numpy())
+    environment_shadow_filter.filter_ratio(config, cells, rows=rows)
+    environment_shadow_filter.spread_ratio(config, params, rays, scene, surroundings.probes, cells, out)
     return out.numpy()
 
 

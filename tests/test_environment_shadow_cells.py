@@ -79,11 +79,11 @@ ON_DESK = EnvironmentShadowConfig(
 
 
 def filtered_cells(ratio, surface, side=4):
-    cells = shadow_cells(surface.shape, notes=False)
+    cells = shadow_cells(surface.shape)
     cells.ratio.assign(np.asarray(ratio, np.float32))
     cells.surface.assign(surface.astype(np.int32))
     config = dataclasses.replace(ON_DESK, side=side)
-    environment_shadow_filter.filter_ratio(config, records(FrameParams, {}), cells)
+    environment_shadow_filter.filter_ratio(config, cells)
     return cells.filtered.numpy()
 
 
@@ -125,7 +125,7 @@ def test_pixels_between_surfaces_find_their_own(device):
     meets = CAMERA + (POINTS - CAMERA) * (0.6 - 0.1) / 0.6
     on_board = (np.abs(meets[..., :2] - (0.003, 0.004)) <= (0.083, 0.061)).all(-1)
     middle = on_board[stride // 2 :: stride, stride // 2 :: stride]
-    averaged = shadow_cells(middle.shape, stride, notes=False)
+    averaged = shadow_cells(middle.shape, stride)
     averaged.surface = wp.array(np.where(middle, 8, 0), dtype=wp.int32)
     averaged.filtered = wp.array(np.where(middle, 0.25, 1.0)[..., None].repeat(3, -1), dtype=wp.vec3)
     out, rays = wp.zeros((H, W), wp.vec3), wp.array(RAYS, dtype=wp.vec2)

@@ -63,8 +63,6 @@ from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RaySc
 
 wp.set_module_options({"enable_backward": False})
 
-SHADED_TILE = wp.constant(4)
-"""Cells along the side of a tile for which shading is recorded."""
 CHUNK = wp.constant(64)
 """Samples that are culled together, one bit of a mask each."""
 TILE_ROWS, TILE_COLUMNS = wp.constant(4), wp.constant(8)
@@ -126,15 +124,13 @@ class EnvironmentShadowConfig:
 
 @wp.struct
 class ShadowCells:
-    """Estimates of all cells and their filtered values; shaded and changed may be empty."""
+    """Estimates of all cells and their filtered values."""
 
     stride: wp.int32  # pixels along a cell
     ratio: wp.array2d[wp.vec4]  # RGB share of the environment that is not hidden, and depth
     bounced: wp.array2d[wp.vec3]  # light of objects there, relative to the environment's
     surface: wp.array2d[wp.int32]  # key of the surface that the cell shows; -1: none, and ratio is not valid
-    shaded: wp.array2d[wp.int32]  # per tile: index of the last frame in which some cell in it was shaded
     filtered: wp.array2d[wp.vec3]  # factor on the frame; written only where a surface is seen
-    changed: wp.array2d[wp.int32]  # per tile: index of the last frame in which some factor in it was not 1
 
 
 @wp.struct
@@ -176,11 +172,6 @@ def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.ve
 def first_of_set(i: wp.int32, j: wp.int32, side: wp.int32, count: wp.int32) -> wp.int32:
     """Return the first sample of a cell's set; ``count`` is the number of samples of all sets."""
     return count / (side * side) * ((i % side) * side + j % side)
-
-
-def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
-    """Return the shape of ``ShadowCells.shaded`` and ``changed`` for so many cells."""
-    return -(-rows // int(SHADED_TILE)), -(-columns // int(SHADED_TILE))
 
 
 @wp.func
@@ -562,9 +553,6 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
             queue_out.sums[2 * partial, i, j] = without
             queue_out.sums[2 * partial + 1, i, j] = hidden
             return
-        unchanged = hidden + reflected.sent == wp.vec3(0.0, 0.0, 0.0)
-        if cells_out.shaded.shape[0] > 0 and not unchanged:
-            cells_out.shaded[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
         cells_out.ratio[i, j] = ratio_of(without, hidden, hit.t)
         cells_out.bounced[i, j] = bounced_of(without, hidden, reflected.sent, reflected.returned)
 
@@ -589,7 +577,7 @@ Args:
     scene: Objects and proxies.
     distant: The environment; arrays that ``config.distant`` does not use may be empty.
     sets: config.side^2 sets of config.count samples or more.
-    cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced, surface and shaded are written. If rays are
+    cells_out: (ceil(H / stride), ceil(W / stride)) cells: ratio, bounced and surface are written. If rays are
         queued, ratio and bounced of cells that objects may shade are left to ``reduce_cells_kernel``.
     queue_out: Secondary rays, and partial sums; empty if ``config.queued`` is not set.
 """
@@ -654,7 +642,6 @@ def make_trace_queue_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
 @wp.kernel(enable_backward=False)
 def reduce_cells_kernel(
     # In:
-    params: wp.array[FrameParams],
     queue: ShadowQueue,
     # Out:
     cells_out: ShadowCells,
@@ -674,9 +661,6 @@ def reduce_cells_kernel(
         for place in range(span[0], span[0] + span[1]):
             sent += queue.reflected[0, place]
             returned += queue.reflected[1, place]
-    unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
-    if cells_out.shaded.shape[0] > 0 and not unchanged:
-        cells_out.shaded[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
     cells_out.ratio[i, j] = ratio_of(without, hidden, cells_out.ratio[i, j][3])
     cells_out.bounced[i, j] = bounced_of(without, hidden, sent, returned)
 
@@ -710,4 +694,4 @@ def shade_by_queue(config: EnvironmentShadowConfig, *given: Any) -> None:
     queue.length.zero_()
     shade_environment(config, *given)
     launch(make_trace_queue_kernel(config), threads, [threads, *given[:-1]], [queue], device=device)
-    launch(reduce_cells_kernel, cells.surface.shape, [given[0], queue], [cells], device=device)
+    launch(reduce_cells_kernel, cells.surface.shape, [queue], [cells], device=device)

@@ -6,8 +6,7 @@ two means differ by more than noise: at contacts and at the edges of an emitter'
 filtered so, have a smaller error than many cells of few samples at twice the rays. Cells on other surfaces are left
 out. A pixel between cells of several surfaces interpolates the cells of its own surface.
 
-Tiles of cells record the index of the frame in which a ray last met an object. In other tiles the ratio is 1 and is not
-filtered. Ratios within ``NEGLIGIBLE`` of 1 are set to exactly 1 and not interpolated to pixels.
+Ratios within ``NEGLIGIBLE`` of 1 are set to exactly 1.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import warp as wp
 from warp_ar.kernels.launch import MOST_REGISTERS, row_launcher
 from warp_ar.kernels.rays.shapes import FACES, MESH_KEY, surface_key
 from warp_ar.kernels.rays.visibility import inside_rect, make_visible_proxy
-from warp_ar.kernels.receiver.environment_shadow import SHADED_TILE, EnvironmentShadowConfig, ShadowCells
+from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 
 wp.set_module_options({"enable_backward": False})
@@ -32,16 +31,6 @@ NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
 """Change of the ratio that is treated as 0: at most a quarter of an 8-bit code."""
 DEPTH_STEP = wp.constant(wp.float32(0.03))
 """Largest relative difference of depth at which neighbours on a mesh count as the same part of it."""
-
-
-@wp.func
-def any_shaded(shaded: wp.array2d[wp.int32], frame_index: wp.int32, rows: wp.vec2i, columns: wp.vec2i) -> wp.bool:
-    """Return whether any tile from the first to the last row and column of cells was shaded in this frame."""
-    for a in range(wp.max(rows[0], 0) / SHADED_TILE, wp.min(rows[1] / SHADED_TILE + 1, shaded.shape[0])):
-        for b in range(wp.max(columns[0], 0) / SHADED_TILE, wp.min(columns[1] / SHADED_TILE + 1, shaded.shape[1])):
-            if shaded[a, b] == frame_index:
-                return True
-    return False
 
 
 @wp.func
@@ -66,7 +55,6 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     def filter_ratio_kernel(
         # In:
         row_start: wp.int32,
-        params: wp.array[FrameParams],
         # Out:
         cells_out: ShadowCells,
     ):
@@ -77,17 +65,11 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         i, j = wp.tid()
         i += row_start
         surface = cells_out.surface
-        shaded = cells_out.shaded
         ratio = cells_out.ratio
         bounced = cells_out.bounced
         key = surface[i, j]
         if key < 0:
             return
-        if shaded.shape[0] > 0:
-            rows = wp.vec2i(i - wp.static(wide), i + wp.static(wide))
-            if not any_shaded(shaded, params[0].frame_index, rows, wp.vec2i(j - wp.static(wide), j + wp.static(wide))):
-                cells_out.filtered[i, j] = wp.vec3(1.0, 1.0, 1.0)
-                return
         depth = ratio[i, j][3]
         # Means of all neighbours, and of the nearer ones; the fourth component sums the weights.
         far_left = wp.vec4(0.0)
@@ -128,8 +110,6 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             mean += share * (sharp + near_sent / near_left[3] - mean)
         if wp.max(wp.abs(mean - wp.vec3(1.0, 1.0, 1.0))) < NEGLIGIBLE:
             mean = wp.vec3(1.0, 1.0, 1.0)
-        elif cells_out.changed.shape[0] > 0:
-            cells_out.changed[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
         cells_out.filtered[i, j] = mean
 
     return filter_ratio_kernel
@@ -199,20 +179,14 @@ def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         rect = params[0].shadow_rect
         begin = place * run
         i += row_start
-        changed = cells.changed
         stride = cells.stride
         stop = wp.min(begin + run, shadow_ratio_out.shape[1])
         # Cell c was estimated at pixel c * stride + stride / 2.
         y = wp.float32(i - stride / 2) / wp.float32(stride)
         row = wp.int32(wp.floor(y))
-        columns = wp.vec2i(begin / stride - 2, stop / stride + 2)  # as far as a pixel looks for its surface
-        # This test costs as much as one pixel, so it is made for longer runs alone.
-        touched = run == 1 or changed.shape[0] == 0
-        if not touched:
-            touched = any_shaded(changed, params[0].frame_index, wp.vec2i(row - 1, row + 2), columns)
         for j in range(begin, stop):
             value = wp.vec3(1.0, 1.0, 1.0)
-            if touched and inside_rect(i, j, rect):
+            if inside_rect(i, j, rect):
                 x = wp.float32(j - stride / 2) / wp.float32(stride)
                 found = between_surfaces(cells.surface, row, wp.int32(wp.floor(x)))
                 key = found[0]
@@ -226,13 +200,12 @@ def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     return spread_ratio_kernel
 
 
-filter_ratio = row_launcher(make_filter_ratio_kernel, like=lambda params, cells: cells.surface)
+filter_ratio = row_launcher(make_filter_ratio_kernel, like=lambda cells: cells.surface)
 """Average the cells' estimates along surfaces; ratios within ``NEGLIGIBLE`` of 1 become exactly 1.
 
 Args:
     config: Configuration of ``shade_environment``.
-    params: (1,) FrameParams: frame_index.
-    cells_out: From ``shade_environment``; filtered and changed are written. If shaded is empty, all cells are averaged.
+    cells_out: From ``shade_environment``; filtered is written.
 """
 
 
@@ -241,10 +214,10 @@ spread_ratio = row_launcher(make_spread_ratio_kernel, runs=True)
 
 Args:
     config: Configuration of ``shade_environment``.
-    params: (1,) FrameParams: camera, shadow_rect, frame_index.
+    params: (1,) FrameParams: camera, shadow_rect.
     rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
     scene: Proxies.
     probes: Mirror balls.
-    cells: From ``filter_ratio``. If changed is empty, all pixels are interpolated.
+    cells: From ``filter_ratio``.
     shadow_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
 """

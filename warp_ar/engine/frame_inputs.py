@@ -35,8 +35,8 @@ from warp_ar.stages.base import Arrays, Reach, Rows
 from warp_ar.tracking.drift import ExposureDrift
 from warp_ar.tracking.tracking import Places
 
-_CLOCK = struct.Struct("<2f2i")
-"""Layout of the frame constants ``time``, ``time_step``, ``frame_index`` and ``environment_reset``."""
+_CLOCK = struct.Struct("<2fi")
+"""Layout of the frame constants ``time``, ``time_step`` and ``environment_reset``."""
 _ALL_RECTS = ("object", "light", "direct", "shadow", "ball")
 """Names of the screen rectangles, in their order in the frame constants."""
 RECTS = ("object", "light", "shadow", "ball")
@@ -286,7 +286,7 @@ class FrameInputs:
         touched += self._place(frame)
         if (frame.pose is not None and self._move(frame.pose)) or self._arrays.version("pose") == 0:
             touched.append("pose")
-        _CLOCK.pack_into(self._clock, 0, frame.seconds, frame.step, frame.index, reset)
+        _CLOCK.pack_into(self._clock, 0, frame.seconds, frame.step, reset)
         self.block.upload()
         if self._take_picture(frame):
             touched.append("frame")

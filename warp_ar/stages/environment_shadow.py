@@ -12,7 +12,7 @@ from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment.environment_samples import SampleSets
 from warp_ar.kernels.receiver import environment_shadow as kernels
 from warp_ar.kernels.receiver import environment_shadow_filter as filters
-from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue, shaded_shape
+from warp_ar.kernels.receiver.environment_shadow import EnvironmentShadowConfig, ShadowCells, ShadowQueue
 from warp_ar.kernels.structs import filled
 from warp_ar.stages import base
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, over_rows
@@ -100,16 +100,13 @@ class EnvironmentShadow(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Return the ratio, and the estimates that are averaged."""
         cells = shadow_cells(self.features)
-        specs = {
+        return {
             "shadow_ratio": ArraySpec(self.shape, wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
             "environment_shadow_ratio": ArraySpec(cells, wp.vec4),
             "environment_shadow_filtered": ArraySpec(cells, wp.vec3),
             "environment_shadow_surface": ArraySpec(cells, wp.int32, -1),
-            "environment_shadow_shaded": ArraySpec(shaded_shape(*cells), wp.int32, -1),
-            "environment_shadow_changed": ArraySpec(shaded_shape(*cells), wp.int32, -1),
             "environment_shadow_bounced": ArraySpec(cells, wp.vec3),
         }
-        return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Return passes for the estimates, then for their means."""
@@ -143,12 +140,12 @@ class EnvironmentShadow(Stage):
         seen = params, arrays["rays"], scene, arrays["probes"], cells, arrays["shadow_ratio"]
         return [
             estimates,
-            over_rows(count, filters.filter_ratio, config, params, cells, extent=cell_rows),
+            over_rows(count, filters.filter_ratio, config, cells, extent=cell_rows),
             over_rows(self.height, filters.spread_ratio, config, *seen, extent=GrowingRows(shadow_rows)),
         ]
 
     def _cells(self, arrays: Arrays) -> ShadowCells:
         """Return the stage's arrays as its kernels read and write them."""
-        names = "ratio", "bounced", "surface", "shaded", "filtered", "changed"
+        names = "ratio", "bounced", "surface", "filtered"
         stride = find_stride(METHODS[self.method], self.height)
         return filled(ShadowCells(), stride=stride, **{name: arrays[f"{self.name}_{name}"] for name in names})
