@@ -39,6 +39,12 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     (warp_ar.Session, {"scene": "desk", "source": None, "calibration": None, "light": None, "budget_ms": None, **RUN}),
     (warp_ar.PipelineSwitcher, {"builder": None, "keep": 0}),
     (Target, {"scene": make_scene(), "quality": warp_ar.PRESETS["low"], "size": None, "exposures": ()}),
+    (warp_ar.load_scene, {"path_or_name": "desk", "files": None}),
+    (sc.loads_scene, {"text": warp_ar.dumps_scene(make_scene()), "path": None, "files": None}),
+    (warp_ar.dumps_scene, {"scene": make_scene(), "folder": None}),
+    (sc.load_calibration, {"path": "a.yml", "transfer": "srgb"}),
+    (warp_ar.Scene, {field.name: getattr(make_scene(), field.name) for field in dataclasses.fields(sc.Scene)}),
+    (sc.PoseSpec, {"poses": (((1.0,) * 9, HALF),), "file": None, "names": ()}),
     (warp_ar.capture_light, {"paths": ["a.jpg"], "ball": None, "shown": None, "focal_35mm": None, "reflectance": None}),
 ]
 WRONG = (object(), 1j, math.nan, b"abc", {}, (math.nan,) * 3, np.full((2, 5), np.nan))

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
-import pathlib
 from collections.abc import Sequence
 
-from warp_ar.declared import check_fields, fits
+from warp_ar.declared import fits
 from warp_ar.engine.layers import check_outputs, expand_outputs
 from warp_ar.errors import UsageError
-from warp_ar.scene import Scene, load_scene
 from warp_ar.scene.messages import nearest
 from warp_ar.stages import STAGES
 from warp_ar.stages.features import AREA_SAMPLES
@@ -26,29 +23,6 @@ def check_number(name: str, value: object, above: float = -math.inf) -> None:
     if not fits(value, float) or value <= above:  # type: ignore[operator]
         right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
         raise UsageError(f"{name} = {value!r}: expected {right}")
-
-
-def check_scene(scene: object) -> None:
-    """Check a scene that may have been built by a program.
-
-    Raises:
-        UsageError: It is no ``Scene``, or a part of it has another type.
-    """
-    if not isinstance(scene, Scene):
-        raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
-    check_fields(scene)
-
-
-def read_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """Return the given scene, or the scene read from a file or by a bundled name, checked.
-
-    Raises:
-        SceneError: The scene cannot be read.
-        UsageError: A part of the scene has another type.
-    """
-    read = scene if isinstance(scene, Scene) else load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
-    check_fields(read)
-    return read
 
 
 def check_methods(quality: Quality) -> None:

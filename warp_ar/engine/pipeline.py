@@ -23,7 +23,7 @@ import warp as wp
 from warp_ar.closing import Closing
 from warp_ar.declared import checked
 from warp_ar.device import exclusive, resolve_device, translating
-from warp_ar.engine.arguments import check_frames, check_methods, check_number, check_scene, read_scene
+from warp_ar.engine.arguments import check_frames, check_methods, check_number
 from warp_ar.engine.environment_history import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
@@ -37,7 +37,7 @@ from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UpdateError, UsageError, WarpArError
 from warp_ar.light.captured import has_places
-from warp_ar.scene import Pose, Scene
+from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.kinds import difference
 from warp_ar.sources.deep_frame import Plate, as_plate, check_plate, codes8
 from warp_ar.sources.exposures import BracketPlan, brightened, find_exposure, plan_bracket
@@ -159,7 +159,7 @@ class Pipeline(Closing):
             SceneError: The scene cannot be used, has a number that is not finite, or has a camera that does not fit
                 ``size``.
         """
-        scene = read_scene(scene)
+        scene = scene if isinstance(scene, Scene) else load_scene(scene)
         outputs = check_frames(exposures, outputs, linear)
         if shown is not None:
             check_number("shown", shown, above=0.0)
@@ -294,10 +294,10 @@ class Pipeline(Closing):
         self.inputs.update(scene, placed=placed, exposed=scene.exposure != before.exposure)
         self.scene, self.plan = scene, plan
 
+    @checked
     def _check_next(self, scene: Scene) -> Scene:
         """Finish submitted frames; return the next scene with its camera scaled to the size of the frames."""
         self._check_usable()
-        check_scene(scene)
         self._finish()
         return dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.declared import checked
 from warp_ar.errors import SceneError
 from warp_ar.files import bracket_depth, check_depth, indentation_depth, is_file, read_bytes, read_text, tag_depth
 from warp_ar.scene.description import Camera
@@ -60,6 +61,7 @@ FISHEYE_ERROR: Final = 0.25
 _EXPECTED: Final = "OpenCV's YAML, JSON or XML"
 
 
+@checked
 def load_calibration(path: str | Path, transfer: str | Path = "srgb", number: str | None = None) -> Camera:
     """Read a calibration file: OpenCV's YAML, JSON or XML, ROS's camera_info, Kalibr's camchain, COLMAP's cameras.
 

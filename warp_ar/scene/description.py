@@ -13,9 +13,11 @@ import math
 from pathlib import Path, PurePosixPath
 from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.declared import check_fields
 from warp_ar.errors import SceneError
 from warp_ar.scene.fields import LIGHT_COLOR, Checked, Key, Length, Place, Share, Turn, Vec3, fail
 from warp_ar.scene.geometry import Mesh, rotation_matrix
@@ -144,20 +146,26 @@ class SourceSpec(Checked):
 
 
 @dataclasses.dataclass(frozen=True)
-class CharucoBoard:
+class CharucoBoard(Checked):
     """Chessboard with a marker in each white square, written ``"charuco 5x7 0.04 0.03"`` in a scene file."""
 
-    columns: int
+    columns: Annotated[int, Key(low=2)]
     """Squares along x."""
-    rows: int
+    rows: Annotated[int, Key(low=2)]
     """Squares along y."""
-    square_length: float
+    square_length: Length
     """Side of a square in metres."""
-    marker_length: float
+    marker_length: Length
     """Side of a marker in metres."""
     legacy: bool = False
     """True for the layout of OpenCV before 4.6, which calib.io prints: a board with an even number of rows begins with
     a marker."""
+
+    def __post_init__(self) -> None:
+        """Check all values."""
+        super().__post_init__()
+        if self.marker_length >= self.square_length:
+            fail(self, "marker_length", "a marker must be smaller than its square")
 
     @property
     def marker_count(self) -> int:
@@ -175,16 +183,16 @@ class CharucoBoard:
 
 
 @dataclasses.dataclass(frozen=True)
-class GridBoard:
+class GridBoard(Checked):
     """Grid of markers with gaps between them, written ``"grid 4x3 0.04 0.01"`` in a scene file."""
 
-    columns: int
+    columns: Annotated[int, Key(low=1)]
     """Markers along x."""
-    rows: int
+    rows: Annotated[int, Key(low=1)]
     """Markers along y."""
-    marker_length: float
+    marker_length: Length
     """Side of a marker in metres."""
-    separation: float
+    separation: Length
     """Gap between neighbouring markers in metres."""
 
     @property
@@ -220,6 +228,8 @@ INTRINSICS: Final = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
 """Keys of ``[camera]`` that give the calibration as numbers."""
 
 
+DICTIONARIES: Final = {name: int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")}
+"""OpenCV's dictionaries of markers by name."""
 TURNS: Final = (0, 90, 180, 270)
 """Allowed values of ``Marker.turn``, degrees."""
 
@@ -228,7 +238,7 @@ TURNS: Final = (0, 90, 180, 270)
 class Marker(Checked):
     """Printed marker or board of markers whose frame is the world frame."""
 
-    dictionary: Annotated[str, Key("-", '"DICT_APRILTAG_36h11"')] = "DICT_4X4_50"
+    dictionary: Annotated[str, Key("-", '"DICT_APRILTAG_36h11"', words=tuple(DICTIONARIES))] = "DICT_4X4_50"
     """OpenCV's name of the ArUco or AprilTag dictionary."""
     id: Annotated[int, Key("-", "7")] = 0
     """Number of the marker; unused with a board."""
@@ -246,8 +256,12 @@ class Marker(Checked):
         """Check all values."""
         if self.turn not in TURNS:
             fail(self, "turn", "expected 0, 90, 180 or 270 degrees")
-        if self.board is None:  # a board has a size of its own
-            super().__post_init__()
+        super().__post_init__()
+        count = len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.dictionary]).bytesList)
+        if self.board is None and self.id >= count:
+            fail(self, "id", f"expected a whole number from 0 to {count - 1}")
+        if self.board is not None and self.board.marker_count > count:
+            fail(self, "board", f"needs {self.board.marker_count} markers; {self.dictionary} has {count}")
 
 
 OwnMarker: TypeAlias = Annotated[Marker | None, Key("-", "{ id = 7, size = 0.05 }")]
@@ -639,9 +653,8 @@ class PoseSpec:
     """Number of each pose's camera in a COLMAP model; empty in other files."""
 
     def __post_init__(self) -> None:
-        """Check that all numbers are finite."""
-        if not all(map(math.isfinite, itertools.chain.from_iterable(itertools.chain(*self.poses)))):
-            fail(self, "poses", "expected finite numbers")
+        """Check the types, and that all numbers are finite."""
+        check_fields(self)
 
     @functools.cached_property
     def _places(self) -> dict[str, list[int]]:
@@ -727,6 +740,14 @@ class Scene:
     """Simulated exposure."""
     path: Path | None = dataclasses.field(default=None, compare=False)
     """File that the scene was read from, or None."""
+
+    def __post_init__(self) -> None:
+        """Check the type of every part.
+
+        Raises:
+            UsageError: A part has another type.
+        """
+        check_fields(self)
 
     @property
     def has_gloss(self) -> bool:

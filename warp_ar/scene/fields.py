@@ -19,6 +19,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, NoReturn, TypeAlias
 
 import numpy as np
 
+from warp_ar.declared import words_for
 from warp_ar.errors import SceneError
 from warp_ar.scene.messages import LARGEST, SMALLEST, nearest
 
@@ -78,8 +79,8 @@ class Field:
         if (value is None and self.optional) or (isinstance(value, str) and value in self.words):
             return value
         if self.form in ("table", "path", "flag", "text"):
-            value = Path(value) if self.form == "path" and isinstance(value, str) else value
-            if isinstance(value, self.kinds):
+            value = Path(value) if value and self.form == "path" and isinstance(value, str) else value
+            if isinstance(value, self.kinds) and value != "":
                 return value
         elif self.form in ("number", "integer"):
             if self._is_right(value):
@@ -122,7 +123,7 @@ class Field:
             case "vector" | "color":
                 what, each = f"a list of {' or '.join(map(str, key.sizes)) or 'several'} numbers", "each "
             case _:
-                return f"expected {' or '.join(kind.__name__ for kind in self.kinds)}"
+                return f"expected {' or '.join(map(words_for, self.kinds))}"
         if key.low == SMALLEST:
             bound = f", {each}above 0" if each else " above 0"
         elif key.low > -LARGEST:

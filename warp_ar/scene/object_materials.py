@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from warp_ar.declared import checked
 from warp_ar.errors import SceneError, printable
 from warp_ar.scene.description import FLATTEST, Object, Scene
 from warp_ar.scene.geometry import Mesh, make_mesh
@@ -68,6 +69,7 @@ def object_from_trimesh(source: Any, **fields: Any) -> Object:
     return Object("mesh", mesh=mesh_from_trimesh(source), **fields)
 
 
+@checked
 def object_at(item: Object, world_from_object: Any) -> Object:
     """Return an object placed by a 4x4 matrix: its ``at``, ``rotate``, ``scale`` and ``stretch`` are replaced.
 

@@ -11,10 +11,12 @@ Constructors apply the same checks to values given in Python; ``loads_scene(dump
 from __future__ import annotations
 
 import importlib.resources
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from warp_ar.declared import checked
 from warp_ar.errors import SceneError, reason
 from warp_ar.files import is_file, is_folder, limits, parse_toml, read_text, too_much
 from warp_ar.scene import sections
@@ -80,7 +82,8 @@ def _desks_beside(path: Path) -> list[str]:
         return []
 
 
-def load_scene(path_or_name: str | Path, files: SceneFiles | None = None) -> Scene:
+@checked
+def load_scene(path_or_name: str | os.PathLike[str], files: SceneFiles | None = None) -> Scene:
     """Read a scene file.
 
     Args:
@@ -178,6 +181,7 @@ class _Sections:
             )
 
 
+@checked
 def loads_scene(text: str, path: str | Path | None = None, files: SceneFiles | None = None) -> Scene:
     """Read a scene from text.
 

@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
 
-import cv2
-
 from warp_ar.files import is_file
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (
@@ -33,7 +31,7 @@ from warp_ar.scene.exif import camera_by_exif
 from warp_ar.scene.fields import Field, FieldError, fields_of, not_used
 from warp_ar.scene.materials import MATERIALS, Material
 from warp_ar.scene.mesh_files import GLTF_SUFFIXES, MESH_SUFFIXES
-from warp_ar.scene.messages import LARGEST, SMALLEST
+from warp_ar.scene.messages import SMALLEST
 from warp_ar.scene.pose_file import check_rotation, load_pose_file, pose_of_position, rotation_of_quaternion
 from warp_ar.scene.scene_files import SceneFiles
 from warp_ar.scene.table import Table
@@ -47,7 +45,6 @@ _BOARDS: Final = (
     '"charuco COLUMNSxROWS SQUARE MARKER" or "grid COLUMNSxROWS MARKER GAP" with lengths in metres, such as '
     '"charuco 5x7 0.04 0.03"'
 )
-_DICTIONARIES: Final = {name: int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 
 
 class SceneTable(Table):
@@ -254,18 +251,12 @@ def read_pose(table: SceneTable) -> PoseSpec:
 
 def read_marker(table: SceneTable) -> Marker:
     """Read ``[marker]``."""
-    dictionary = table.choice("dictionary", _DICTIONARIES, Marker.dictionary)
-    count = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[dictionary]).bytesList)
     if "board" not in table:
-        number = table.integer("id", Marker.id, low=0, high=count - 1)
-        return read_fields(table, Marker, dictionary=dictionary, id=number)
+        return read_fields(table, Marker)
     for key in ("id", "size"):
         if key in table:
             table.fail(key, "not used beside board, which says its own sizes; remove one of the two")
-    marker = read_fields(table, Marker, dictionary=dictionary, size=Marker.size)
-    if marker.board is not None and marker.board.marker_count > count:
-        table.fail("board", f"needs {marker.board.marker_count} markers; {dictionary} has {count}")
-    return marker
+    return read_fields(table, Marker, size=Marker.size)
 
 
 def _own_marker(parent: SceneTable) -> Marker:
@@ -305,17 +296,12 @@ def _read_board(table: SceneTable) -> Board:
         first, second = float(words[2]), float(words[3])
     except ValueError:
         first = second = math.nan
-    if not (SMALLEST <= first <= LARGEST and SMALLEST <= second <= LARGEST):
-        table.fail("board", f"lengths must be above 0 and finite; expected {_BOARDS}")
-    if words[0] == "grid":
-        if columns < 1 or rows < 1:
-            table.fail("board", "a grid has at least 1x1 markers")
-        return GridBoard(columns, rows, first, second)
-    if columns < 2 or rows < 2:
-        table.fail("board", "a ChArUco board has at least 2x2 squares")
-    if second >= first:
-        table.fail("board", "a marker must be smaller than its square; the square's length comes first")
-    return CharucoBoard(columns, rows, first, second, words[0] == "charuco-legacy")
+    try:
+        if words[0] == "grid":
+            return GridBoard(columns, rows, first, second)
+        return CharucoBoard(columns, rows, first, second, words[0] == "charuco-legacy")
+    except FieldError as error:
+        table.fail("board", f"{error.key}: {error.right}; expected {_BOARDS}")
 
 
 # ---- what is virtual -------------------------------------------------------------------------------------------------

@@ -9,12 +9,14 @@ from typing import Any
 
 import tomlkit
 
+from warp_ar.declared import checked
 from warp_ar.errors import SceneError
 from warp_ar.scene.description import INTRINSICS, Board, Marker, PoseSpec, Scene
 from warp_ar.scene.fields import fields_of, not_used
 from warp_ar.scene.materials import MATERIALS
 
 
+@checked
 def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     """Return a scene as TOML that :func:`loads_scene` reads into an equal scene.
 

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.errors import UsageError
 from warp_ar.scene import CharucoBoard, Marker, Scene
+from warp_ar.scene.description import DICTIONARIES
 from warp_ar.scene.geometry import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -35,19 +35,8 @@ class Detection:
 
 
 def find_dictionary(name: str) -> Any:
-    """Return OpenCV's predefined marker dictionary of a name.
-
-    Args:
-        name: such as ``"DICT_4X4_50"`` or ``"DICT_APRILTAG_36h11"``.
-
-    Raises:
-        UsageError: if OpenCV has none of that name.
-    """
-    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
-    if not isinstance(number, int):
-        known = ", ".join(sorted(key for key in dir(cv2.aruco) if key.startswith("DICT_")))
-        raise UsageError(f"marker dictionary: OpenCV has no {name!r}; it has {known}")
-    return cv2.aruco.getPredefinedDictionary(number)
+    """Return OpenCV's predefined marker dictionary of a name, such as ``"DICT_4X4_50"``."""
+    return cv2.aruco.getPredefinedDictionary(DICTIONARIES[name])
 
 
 def tell_upright(scene: Scene) -> str:
@@ -62,19 +51,10 @@ def tell_upright(scene: Scene) -> str:
 
 
 def make_board(marker: Marker) -> Any:
-    """Return OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, with y down.
-
-    Raises:
-        UsageError: if the dictionary holds too few markers, or none of that name exists.
-    """
+    """Return OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, with y down."""
     board = marker.board
     assert board is not None
     dictionary = find_dictionary(marker.dictionary)
-    available = len(dictionary.bytesList)
-    if available < board.marker_count:
-        raise UsageError(
-            f"marker board: {board} needs {board.marker_count} markers; {marker.dictionary} has {available}"
-        )
     if isinstance(board, CharucoBoard):
         made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_length, board.marker_length, dictionary)
         made.setLegacyPattern(board.legacy)
@@ -184,19 +164,12 @@ def _edge_points(edges: Array) -> tuple[Array, Array, Array, Array]:
 
 @functools.cache
 def pattern_of(marker: Marker) -> Pattern:
-    """Return the geometry of a marker's or board's print.
-
-    Raises:
-        UsageError: The marker does not exist.
-    """
+    """Return the geometry of a marker's or board's print."""
     size, board, turn = marker.size, marker.board, marker.turn
     book = find_dictionary(marker.dictionary)
     bits = int(book.markerSize) + 2
     edges: list[tuple[float, ...]] = []
     if board is None:
-        if not 0 <= marker.id < len(book.bytesList):
-            right = f"{marker.dictionary} has ids 0 to {len(book.bytesList) - 1}"
-            raise UsageError(f"marker id: {right}, not {marker.id}")
         places, width, height, margin = {marker.id: (-size / 2, size / 2)}, size, size, size / bits
     else:
         printed = make_board(marker)
