@@ -79,7 +79,7 @@ def run_program(found: Capture, device: str, **methods: str) -> NDArray[Any]:
     pose = found.support.pose
     x, y, z = (float(v) for v in pose.inverse().apply(BALL * np.array(found.outline.sphere)))
     probe = Probe((x, y, z), BALL, (REFLECTANCE,) * 3)
-    scene = make_scene(found, Path("light.exr"), BALL)
+    scene = make_scene(found, Path("light.exr"))
     scene = dataclasses.replace(scene, captured=None, source=None, probes=(probe,), has_marker=True)
     quality = PRESETS[DEFAULT_PRESET].with_methods(**methods) if methods else PRESETS[DEFAULT_PRESET]
     pipeline = Pipeline(scene, device=device, quality=quality, outputs=("environment",))

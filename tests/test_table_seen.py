@@ -21,7 +21,7 @@ BRIGHTEST_WOOD = (0.3, 0.5)
 """Reflectance of the brightest tenth of the room's table, mean of RGB, less what the ball shades."""
 
 
-def table_of(room, seed=0, off=1.0):
+def table_of(room, seed=0, off=1.0, stand=None):
     """The table of a photographed room, with the contact picked ``off`` pixels away, and the exposure's gain."""
     matrix = np.array([[FOCAL, 0, CAMERA.cx], [0, FOCAL, CAMERA.cy], [0, 0, 1]])
     rotation, translation = look_at(room.center + np.array([0.06, -0.42, 0.25]), np.array([0.02, 0.02, 0.03]))
@@ -33,7 +33,10 @@ def table_of(room, seed=0, off=1.0):
     sphere = (x / room.radius, y / room.radius, z / room.radius)
     outline = BallOutline((0.0, 0.0), (1.0, 1.0), 0.0, (0.0, 0.0, 0.0), 1.0, sphere)
     x, y, z = rotation @ (0.0, 0.0, room.lift) + translation
-    plane = plane_from_contact(sphere, CAMERA, (x / z * FOCAL + CAMERA.cx + off, y / z * FOCAL + CAMERA.cy - off))
+    contact = x / z * FOCAL + CAMERA.cx + off, y / z * FOCAL + CAMERA.cy - off
+    plane = plane_from_contact(sphere, CAMERA, contact)
+    if stand is not None:
+        plane = plane_from_contact(sphere, CAMERA, contact, room.radius, stand=stand)
     return Table.under(outline, encode_srgb(light).astype(np.uint8), CAMERA, plane, decode_table("srgb")), gain
 
 
@@ -43,6 +46,17 @@ def test_a_ball_s_reflectance_is_told_with_an_interval_that_holds(seed, reflecta
     told = table.reflectance_of_ball()
     assert told.reflectance == pytest.approx((reflectance,) * 3, abs=WITHIN)
     assert abs(np.log(np.mean(told.reflectance) / reflectance)) < 2.0 * told.deviation < 0.15
+
+
+def test_a_ball_on_a_stand_of_known_height_is_over_the_table():
+    room = Room(seed=11, table=(0.8, 0.6), lift=0.08, reflectance=0.7)
+    table, gain = table_of(room, off=0.0, stand=room.lift)
+    assert table.probe.center == pytest.approx((0.0, 0.0, room.lift + room.radius), abs=1e-6)
+    assert table.probe.radius == room.radius
+    told = table.reflectance_of_ball()
+    assert told is None or told.reflectance == pytest.approx((0.7,) * 3, abs=WITHIN)
+    true = (gain * true_environment(room, 32)).astype(np.float32)
+    assert BRIGHTEST_WOOD[0] < table.reflectance_under(irradiance_above(true)) < BRIGHTEST_WOOD[1]
 
 
 def test_light_that_is_too_low_makes_the_table_too_white():

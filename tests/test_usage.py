@@ -129,6 +129,7 @@ CASES = {
         ("--ball-radius -3", "--ball-radius -3: expected metres above 0, 1 at most"),
         ("--ball-radius 4", "1 at most; 4 cm are 0.04"),
         ("--ball-radius 35", "1 at most; 35 mm are 0.035"),
+        ("--contact 1 2 --stand 0.1", "--stand 0.1: expected --contact and --ball-radius beside it"),
         ("--contact nan 100", "--contact nan: expected pixels"),
         ("--outline outline.jpg", "--outline outline.jpg: expected a name that ends in .png"),
         ("--output new.jpg", "new.jpg: expected a name that ends in .exr"),

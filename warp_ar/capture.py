@@ -85,6 +85,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_common("--rectangle-size", add=add)
     add("--contact", type=pixel, nargs=2, metavar=("X", "Y"), help="pixel where the ball touches the plane")
     add("--ball-radius", type=float, metavar="M", help="the ball's radius in metres (default: lengths are in radii)")
+    text = "height of a stand under the ball (--contact)"
+    add("--stand", type=number(0.0, 100.0, "metres from 0 to 100"), metavar="M", help=text)
     add("--scene", type=ending(".toml"), metavar="FILE.toml", help="also write a scene of the photograph")
     return parser
 
@@ -93,7 +95,8 @@ def _support_of(options: argparse.Namespace, outline: BallOutline, camera: Camer
     if options.rectangle is not None:
         corners = np.array(options.rectangle).reshape(4, 2).tolist()
         return plane_from_rectangle(camera, corners, tuple(options.rectangle_size))
-    return plane_from_contact(outline.sphere, camera, options.contact, options.ball_radius or 1.0)
+    radius, stand = options.ball_radius or 1.0, options.stand or 0.0
+    return plane_from_contact(outline.sphere, camera, options.contact, radius, stand=stand)
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -101,6 +104,8 @@ def _check(options: argparse.Namespace) -> None:
         raise UsageError("--rectangle and --rectangle-size belong together: pixels of the corners, metres of the sides")
     if options.rectangle is not None and options.contact is not None:
         raise UsageError("--rectangle and --contact both define the plane; give one of the two")
+    if options.stand is not None and (options.contact is None or options.ball_radius is None):
+        raise UsageError(f"--stand {options.stand:g}: expected --contact and --ball-radius beside it")
     if options.ball is not None and options.circle is not None:
         raise UsageError("--ball is a rough circle and --circle an exact one; give one of the two")
     if options.shown is not None and options.shown not in options.photos:
@@ -128,10 +133,10 @@ def _check_radius(options: argparse.Namespace) -> None:
         raise UsageError(f"--ball-radius {radius:g}: expected metres above 0, {LARGEST_BALL:g} at most{hint}")
 
 
-def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
+def make_scene(found: Capture, light: Path) -> Scene:
     """Return a scene of the photograph in the captured light, with a virtual ball on each side of the mirror ball."""
     assert found.support is not None
-    unit = ball_radius or found.support.radius_of(found.outline.sphere)
+    unit = found.support.radius_of(found.outline.sphere)
     x, y, _ = map(float, found.support.pose.inverse().apply(unit * np.array(found.outline.sphere)))
     return scene_on(found.support, found.camera, found.shown, CapturedLight(light.resolve()), (x, y), unit)
 
@@ -167,6 +172,7 @@ def capture(options: argparse.Namespace) -> int:
         transfer=options.transfer,
         focal_35mm=options.focal_35mm,
         support=(lambda outline, camera: _support_of(options, outline, camera)) if wanted else None,
+        ball_radius=options.ball_radius,
         reflectance=options.reflectance,
         device=options.device,
         height=options.height,
@@ -197,7 +203,7 @@ def capture(options: argparse.Namespace) -> int:
         print(f"{response}: the camera's response, for [camera] transfer")
         found = dataclasses.replace(found, camera=dataclasses.replace(found.camera, transfer=response.resolve()))
     if options.scene is not None:
-        scene = make_scene(found, options.output, options.ball_radius)
+        scene = make_scene(found, options.output)
         store(options.scene, dumps_scene(scene, options.scene.parent).encode())
         for finding in check_objects(scene, scene.camera, written_poses(scene)):
             say(f"{options.scene}: {finding.text}; to do: {finding.remedy}")

@@ -92,6 +92,7 @@ def capture_light(
     transfer: str = "srgb",
     focal_35mm: float | None = None,
     support: Callable[[BallOutline, Camera], Support] | None = None,
+    ball_radius: float | None = None,
     reflectance: float | None = None,
     device: str = "auto",
     height: int | None = None,
@@ -111,6 +112,7 @@ def capture_light(
         focal_35mm: Focal length of the picture as it is, in millimetres for a full frame; None: from EXIF.
         support: Function that finds the plane that the ball stands on. The light uses the plane's axes; None: the
             plane and axes of the printed card if the shown photograph has it, else the axes of a level camera.
+        ball_radius: Radius of the ball, metres; None: it stands on the plane.
         reflectance: Reflectance of the ball; None: measured by its reflection of the support's plane, else ``GUESS``.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         height: Rows of the map; None: chosen by the ball's size in pixels.
@@ -155,6 +157,8 @@ def capture_light(
     elif (card := card_points(reference.image)) is not None:
         found = plane_from_points(camera, *card)
         notes.append(f"the plane is the printed card's, whose corners are off by {found.error:.1f} pixels")
+    if found is not None and ball_radius is not None:
+        found = dataclasses.replace(found, ball_radius=ball_radius)
     turn = np.array(pose_of_position((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0]).reshape(3, 3)
     table = None
     if found is not None:

@@ -50,12 +50,16 @@ class Support:
     """Standard deviation of the plane's normal, degrees."""
     error: float
     """Root mean square distance in pixels of the selected points from the plane's points; 0 without redundancy."""
+    ball_radius: float | None = None
+    """Radius of the ball, metres, if it is known; None: the ball stands on the plane."""
 
     def radius_of(self, sphere: Sequence[float]) -> float:
-        """Return the radius of a ball on the plane, from its centre in the camera's frame divided by its radius.
+        """Return the radius of the ball, from its centre in the camera's frame divided by its radius.
 
-        Of all balls with the same outline, it is the one whose centre is one radius above the plane.
+        Of all balls with the same outline, one whose centre is one radius above the plane stands on it.
         """
+        if self.ball_radius is not None:
+            return self.ball_radius
         up = self.pose.rotation[:, 2]
         return max(float(up @ self.pose.translation / (up @ np.array(sphere) - 1.0)), 1e-3)
 
@@ -291,9 +295,14 @@ def _solve(camera: Camera, corners: Array, points: Array) -> tuple[Pose, float]:
 
 
 def plane_from_contact(
-    sphere: Sequence[float], camera: Camera, contact: Sequence[float], radius: float = 1.0, picked: float = 2.0
+    sphere: Sequence[float],
+    camera: Camera,
+    contact: Sequence[float],
+    radius: float = 1.0,
+    picked: float = 2.0,
+    stand: float = 0.0,
 ) -> Support:
-    """Return the plane that touches a ball at a pixel, the visible or guessed point of contact.
+    """Return the plane under a ball that touches it, or a stand on it, at a pixel: the visible or guessed contact.
 
     A ball touches the table behind its lower half, where the ray through the pixel leaves the ball. The plane's normal
     is the ball's normal at that point. An error of d pixels tilts the normal by d divided by the radius in pixels, and
@@ -305,6 +314,7 @@ def plane_from_contact(
         contact: Column and row of the point of contact.
         radius: Radius of the ball, metres; 1 if unknown: the world's unit is then the radius.
         picked: Standard deviation of the point of contact in pixels.
+        stand: Height of the stand between plane and ball, metres.
 
     Raises:
         UsageError: The pixel is not on the ball.
@@ -328,8 +338,7 @@ def plane_from_contact(
         forward = np.array([0.0, -1.0, 0.0]) + up[1] * up
     forward /= np.linalg.norm(forward)
     rotation = np.stack([np.cross(forward, up), forward, up], 1)
-    foot = radius * (center - up)
-    # The point of contact is the world's origin.
-    return Support(
-        Pose(rotation, foot), float(np.hypot(max(turned[:2], default=90.0), max(turned[2:], default=90.0))), 0.0
-    )
+    foot = radius * center - (radius + stand) * up
+    # The point below the contact is the world's origin.
+    tilt = float(np.hypot(max(turned[:2], default=90.0), max(turned[2:], default=90.0)))
+    return Support(Pose(rotation, foot), tilt, 0.0, radius)
