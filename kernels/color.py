@@ -48,7 +48,7 @@ SATURATION_ENTRY = wp.constant(256)
 BELOW_SATURATION = wp.constant(wp.float32(-1.0))
 # Chroma at half the resolution (4:2:0) lowers the clipped blue of a small emitter to 239 to 252 (measured in H.264).
 # If another channel clips, codes down to 7 below saturation count as clipped; lower codes are often true values.
-BESIDE_SATURATION = wp.constant(wp.float32(-7.0))
+NEAR_SATURATION = wp.constant(wp.float32(-7.0))
 
 
 @wp.func
@@ -93,7 +93,7 @@ def is_saturated(code: wp.vec3ub, saturation: wp.vec3) -> wp.vec3:
     r = wp.float32(code[0]) - saturation[0]
     g = wp.float32(code[1]) - saturation[1]
     b = wp.float32(code[2]) - saturation[2]
-    least = wp.where(wp.max(wp.max(r, g), b) >= BELOW_SATURATION, BESIDE_SATURATION, BELOW_SATURATION)
+    least = wp.where(wp.max(wp.max(r, g), b) >= BELOW_SATURATION, NEAR_SATURATION, BELOW_SATURATION)
     return wp.vec3(wp.where(r >= least, 1.0, 0.0), wp.where(g >= least, 1.0, 0.0), wp.where(b >= least, 1.0, 0.0))
 
 

@@ -69,7 +69,7 @@ def wrap_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int3
 
 
 @wp.func
-def beside_in_row(row: wp.int32, x: wp.float32, height: wp.int32, width: wp.int32):
+def neighbours_in_row(row: wp.int32, x: wp.float32, height: wp.int32, width: wp.int32):
     """Return the two texels next to x in a row, and the fraction of the way from the first to the second.
 
     x counts from the centre of texel 0. A row beyond a pole continues half a turn away.
@@ -90,8 +90,8 @@ def beside_in_row(row: wp.int32, x: wp.float32, height: wp.int32, width: wp.int3
 
 @wp.func
 def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> wp.vec3:
-    """Return the linearly interpolated radiance in one row at x; see ``beside_in_row``."""
-    first, second, t = beside_in_row(row, x, radiance.shape[0], radiance.shape[1])
+    """Return the linearly interpolated radiance in one row at x; see ``neighbours_in_row``."""
+    first, second, t = neighbours_in_row(row, x, radiance.shape[0], radiance.shape[1])
     a = radiance[first[0], first[1]]
     return a + t * (radiance[second[0], second[1]] - a)
 
@@ -118,7 +118,7 @@ def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3
     if i < 0 or i + 1 >= height or j < 0 or j + 1 >= width:
         part = wp.int32(0)
         while part < 2:
-            first, second, t = beside_in_row(i + part, x, height, width)
+            first, second, t = neighbours_in_row(i + part, x, height, width)
             if part == 0:
                 above_left = first
                 above_right = second

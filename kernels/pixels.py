@@ -44,8 +44,8 @@ def shown_radiance(picture: Picture, row: wp.int32, column: wp.int32) -> wp.vec3
 def between_codes(table: wp.array[wp.vec3], value: wp.float32, code: wp.uint8, channel: wp.int32) -> wp.float32:
     """Return the distance of a linear value from the value of its 8-bit code, in codes."""
     here = wp.int32(code)
-    beside = wp.where(value > table[here][channel], wp.min(here + 1, 255), wp.max(here - 1, 0))
-    step = wp.abs(table[beside][channel] - table[here][channel])
+    neighbour = wp.where(value > table[here][channel], wp.min(here + 1, 255), wp.max(here - 1, 0))
+    step = wp.abs(table[neighbour][channel] - table[here][channel])
     if not step > 0.0:
         return wp.float32(0.0)  # the end of the range, or a plateau of a measured response
     return (value - table[here][channel]) / step
@@ -89,11 +89,11 @@ def clip_levels(table: wp.array[wp.vec3]) -> mat23:
 @wp.func
 def is_at_clipping(value: wp.vec3, levels: mat23) -> wp.vec3:
     """Return 1 in the clipped channels of a linear pixel, else 0; replaces ``is_saturated`` for linear frames."""
-    beside = wp.bool(False)
+    any_clipped = wp.bool(False)
     for channel in range(3):
-        beside = beside or value[channel] >= levels[0, channel]
+        any_clipped = any_clipped or value[channel] >= levels[0, channel]
     least = levels[0]
-    if beside:
+    if any_clipped:
         least = levels[1]
     return wp.vec3(
         wp.where(value[0] >= least[0], 1.0, 0.0),

@@ -76,7 +76,7 @@ def test_captured_light_stands_for_the_balls(files, wanted, tmp_path):
     assert edits.wanted_record(after)["captured"].endswith("own.exr")
     assert "/" not in edits.wanted_record(after)["captured"]
     # What was dropped is saved beside the scene, by its name alone.
-    saved = dumps_scene(dataclasses.replace(edits.beside(after.scene, tmp_path), path=None))
+    saved = dumps_scene(dataclasses.replace(edits.with_bare_names(after.scene, tmp_path), path=None))
     assert str(tmp_path) not in saved
 
 
@@ -85,7 +85,7 @@ def test_a_saved_scene_with_dropped_meshes_is_taken_again(files, wanted, tmp_pat
     for size in (0.05, 0.08):
         make, _, _ = files.take("my box.glb", trimesh.creation.box((size,) * 3).export(file_type="glb"), wanted)
         wanted = make(wanted)
-    saved = dumps_scene(dataclasses.replace(edits.beside(wanted.scene, tmp_path), path=None))
+    saved = dumps_scene(dataclasses.replace(edits.with_bare_names(wanted.scene, tmp_path), path=None))
     make, _, _ = files.take("scene.toml", saved.encode(), wanted)
     again = make(wanted).scene.objects
     assert [item.file for item in again] == [item.file for item in wanted.scene.objects]

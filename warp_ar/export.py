@@ -67,32 +67,32 @@ def export(options: argparse.Namespace) -> int:
         load_usd()
     scene = load_scene(options.scene)
     maps = environment_names(scene)
-    beside = {name: output.with_name(f"{output.stem}_{name}.exr") for name in (*maps, "undistort", "distort")}
+    side_files = {name: output.with_name(f"{output.stem}_{name}.exr") for name in (*maps, "undistort", "distort")}
     if options.no_environment or output.suffix.lower() == TRACK_SUFFIX:
-        beside = {name: path for name, path in beside.items() if name not in maps}
+        side_files = {name: path for name, path in side_files.items() if name not in maps}
     if not options.stmaps:
-        del beside["undistort"], beside["distort"]
+        del side_files["undistort"], side_files["distort"]
     textures = texture_files(scene, output) if output.suffix.lower() in USD_SUFFIXES else {}
-    writes = {"--output": output, **{f"--output's {name}": path for name, path in {**beside, **textures}.items()}}
+    writes = {"--output": output, **{f"--output's {name}": path for name, path in {**side_files, **textures}.items()}}
     claim_places(reads_of(scene, options), writes, overwrite=options.overwrite)
     shot, light = _read_shot(options, scene)
-    beside = {name: path for name, path in beside.items() if name not in maps[len(light) :]}
+    side_files = {name: path for name, path in side_files.items() if name not in maps[len(light) :]}
     for name, radiance in zip(maps, light, strict=False):
-        write_environment(beside[name], radiance, overwrite=True, axes="y-up")
+        write_environment(side_files[name], radiance, overwrite=True, axes="y-up")
     if light:
         _clear_stale(output, len(light))
         others = tuple(
-            (beside[name], scene.probes[ball].center) for ball, name in enumerate(maps[: len(light)]) if ball
+            (side_files[name], scene.probes[ball].center) for ball, name in enumerate(maps[: len(light)]) if ball
         )
-        shot = dataclasses.replace(shot, environment=beside[maps[0]], radiance=light[0], others=others)
+        shot = dataclasses.replace(shot, environment=side_files[maps[0]], radiance=light[0], others=others)
     for name, make in (("undistort", undistort_map), ("distort", distort_map)):
-        if name in beside:
-            write_stmap(beside[name], make(shot.camera))
+        if name in side_files:
+            write_stmap(side_files[name], make(shot.camera))
     write = {GLTF_SUFFIX: write_glb, TRACK_SUFFIX: write_track}.get(output.suffix.lower(), write_usd)
     written = write(output, shot)
     lost = sum(pose is None for pose in shot.poses)
     print(f"{len(shot.poses)} frames" + (f", {lost} without a pose" if lost else ""))
-    for path in (*written, *beside.values()):
+    for path in (*written, *side_files.values()):
         print(path)
     return EXIT_DONE
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.kernels.latlong import PI, beside_in_row
+from warp_ar.kernels.latlong import PI, neighbours_in_row
 from warp_ar.kernels.launch import Rows, launch_rows, row_launcher
 from warp_ar.kernels.safe_math import smooth_ramp, usable_confidence
 
@@ -41,8 +41,8 @@ def band_solid_angle(start: wp.float32, stop: wp.float32, height: wp.int32) -> w
 def sample_level_row(
     levels: wp.array[wp.vec4], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.int32, x: wp.float32
 ) -> wp.vec3:
-    """Sample one row of a level linearly, across the seam and the poles; see ``latlong.beside_in_row``."""
-    first, second, t = beside_in_row(row, x, height, width)
+    """Sample one row of a level linearly, across the seam and the poles; see ``latlong.neighbours_in_row``."""
+    first, second, t = neighbours_in_row(row, x, height, width)
     a = levels[offset + first[0] * width + first[1]]
     b = levels[offset + second[0] * width + second[1]]
     return wp.vec3(a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))

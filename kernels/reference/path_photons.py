@@ -80,7 +80,7 @@ from warp_ar.kernels.structs import DIRECTIONAL, LAMBERT, MIRROR, SPHERE, FrameP
 
 wp.set_module_options({"enable_backward": False})
 
-BESIDE_PIXELS = wp.constant(wp.uint32(0x80000000))
+PATH_OFFSET = wp.constant(wp.uint32(0x80000000))
 """Offset of a path's index, so that it does not share the random numbers of a pixel."""
 START = wp.constant(2)
 ON_EMITTER = wp.constant(3)
@@ -299,7 +299,7 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
         k = wp.tid() + row_start
         key = PathKey()
         # An index that no pixel has.
-        key.pixel = wp.uint32(k) + BESIDE_PIXELS
+        key.pixel = wp.uint32(k) + PATH_OFFSET
         key.sample = wp.uint32(number)
         key.seed = wp.uint32(seed)
         origin = wp.vec3(0.0, 0.0, 0.0)

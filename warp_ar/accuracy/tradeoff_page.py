@@ -88,10 +88,10 @@ def table(head: Cells, rows: Iterable[tuple[Cells, bool]]) -> str:
     return f"<table><thead><tr>{top}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
-def split(chart: str, beside: str, words: str) -> str:
+def split(chart: str, other: str, words: str) -> str:
     """Return a chart with a table and a sentence next to it."""
     words = f"<p class=soft>{html.escape(words)}</p>" if words else ""
-    return f'<div class="split"><div class="card">{chart}</div><div class="card">{beside}{words}</div></div>'
+    return f'<div class="split"><div class="card">{chart}</div><div class="card">{other}{words}</div></div>'
 
 
 def _is_beaten(whole: Whole, others: Sequence[Whole]) -> bool:

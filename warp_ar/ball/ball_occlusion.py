@@ -60,7 +60,7 @@ LOOK_SECONDS = 0.1
 discs."""
 RINGS = (1.2, 1.7, 2.4, 3.4, 5.0)
 """Radii of the circles of points on planes around a ball, relative to the ball's radius."""
-BESIDE = (1.1, 3.0)
+SURROUNDINGS = (1.1, 3.0)
 """Range of distances in the picture from a ball's centre of points next to it, relative to the radius of its disc."""
 CELLS = 16
 """Number of cells along a ball's disc."""
@@ -167,7 +167,7 @@ class BallCover:
         at = project(self._camera, pose.apply(self._points[seen]))
         for (x, y, radius), has_changed in zip(discs, changed, strict=True):
             away = np.hypot(at[:, 0] - x, at[:, 1] - y) / radius
-            near = (away > BESIDE[0]) & (away < BESIDE[1])
+            near = (away > SURROUNDINGS[0]) & (away < SURROUNDINGS[1])
             if has_changed and near.sum() >= LEAST_NEAR and is_other[near].mean() >= NEAR_SHARE:
                 return True
         return False

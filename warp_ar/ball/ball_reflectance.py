@@ -33,7 +33,7 @@ FACING: Final = 0.35
 """Smallest cosine of incidence on the ball; closer to its rim, a pixel mirrors a wide area."""
 GRAZING: Final = 0.25
 """Smallest cosine at which a plane is seen, directly and by way of the ball; at grazing angles even paper is glossy."""
-BESIDE: Final = 1.15
+CLEAR: Final = 1.15
 """Distance in the picture from the ball's centre, in radii, from which a point is not hidden by the ball."""
 CODES: Final = (12, 200)
 """Range of codes that are neither quantised nor near clipping."""
@@ -185,8 +185,8 @@ def are_seen(scene: Scene, camera: Camera, probe: Probe, pose: Pose, points: Arr
     for ball in scene.probes:
         offset = np.array(ball.center, float) - eye
         along = direction @ offset
-        beside = np.sqrt(np.maximum(float(offset @ offset) - along**2, 0.0))
-        seen &= (beside > BESIDE * ball.radius) | (along > away)
+        from_ray = np.sqrt(np.maximum(float(offset @ offset) - along**2, 0.0))
+        seen &= (from_ray > CLEAR * ball.radius) | (along > away)
     return np.asarray(seen, np.bool_)
 
 

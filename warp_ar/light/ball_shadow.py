@@ -156,23 +156,23 @@ def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
     ratio = np.full(len(shown), np.nan)
     ratio[usable] = np.log(shown[usable]) - np.log(np.maximum((captured + added)[usable], 1e-9))
     given = np.stack([shown, captured, added, problem.shared])
-    beside, across, sides = np.zeros(len(SHARES)), np.zeros(len(SHARES)), np.zeros((2, len(SHARES)))
-    passing, side = passing_shares(problem, unknowns, ball, (config.beside, config.across))
+    near, across, sides = np.zeros(len(SHARES)), np.zeros(len(SHARES)), np.zeros((2, len(SHARES)))
+    passing, side = passing_shares(problem, unknowns, ball, (config.near, config.across))
     for surface in np.unique(problem.surface[usable]):
         own = usable & (problem.surface == surface)
-        elsewhere, here = own & (passing[0] < config.elsewhere), own & (passing[0] > config.beside_share)
+        elsewhere, here = own & (passing[0] < config.elsewhere), own & (passing[0] > config.near_share)
         if min(elsewhere.sum(), here.sum()) >= config.points:
             level, scatter = _level(ratio[elsewhere])
             known = float(np.hypot(scatter, config.level))
             told = [costs(given[:, one], scatter, level, known) for one in (here, here & (side < 0), here & (side > 0))]
-            beside += told[0]
+            near += told[0]
             sides += told[1:]
         elsewhere, here = own & (passing[1] < config.elsewhere), own & (passing[1] > config.elsewhere)
         if min(elsewhere.sum(), here.sum()) >= config.points:
             level, scatter = _level(ratio[elsewhere])
             across += costs(given[:, here], scatter, level, None)
     directed = share_told(across)
-    return min(share_told(beside, sides), directed + ELSEWHERE * (1.0 - directed))
+    return min(share_told(near, sides), directed + ELSEWHERE * (1.0 - directed))
 
 
 def _level(ratio: Array) -> tuple[float, float]:

@@ -212,9 +212,9 @@ class EvidenceConfig:
 class ShadowConfig:
     """Parameters of the test that recovered light reaches the ball (``ball_shadow.py``)."""
 
-    beside: float = 2.0
+    near: float = 2.0
     """Distance in radii within which a ray passes close to the ball, for points next to the ball's shadow."""
-    beside_share: float = 0.5
+    near_share: float = 0.5
     """Least share of such rays in the light added at a tested point."""
     across: float = 3.5
     """Distance in radii within which a ray passes the ball, for points that measure the shadow's contrast."""

@@ -57,7 +57,7 @@ def load_mesh(path: str | Path) -> Mesh:
     return _load(Path(path))[0]
 
 
-def files_beside(path: Path) -> dict[str, bytes]:
+def referenced_files(path: Path) -> dict[str, bytes]:
     """Return the contents of the files that a mesh file refers to (materials, buffers, textures), by their names in it.
 
     Raises:

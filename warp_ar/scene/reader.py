@@ -73,11 +73,11 @@ def _scene_in(folder: Path) -> Path:
     return found[0]
 
 
-def _desks_beside(path: Path) -> list[str]:
+def _scenes_in_folder(path: Path) -> list[str]:
     """Return the folders with a scene next to a missing path, for suggestions in messages."""
     try:
-        beside = sorted(folder for folder in path.parent.iterdir() if is_folder(folder))[:200]
-        return [str(folder) for folder in beside if any(folder.glob("[!.]*.toml"))]
+        folders = sorted(folder for folder in path.parent.iterdir() if is_folder(folder))[:200]
+        return [str(folder) for folder in folders if any(folder.glob("[!.]*.toml"))]
     except (OSError, ValueError):
         return []
 
@@ -99,7 +99,7 @@ def load_scene(path_or_name: str | os.PathLike[str], files: SceneFiles | None = 
         path = _scene_in(path)
     if not is_file(path):
         if str(path_or_name) not in bundled:
-            known = [*_desks_beside(path), *bundled]
+            known = [*_scenes_in_folder(path), *bundled]
             hint = f"a file, or a bundled scene ({nearest(str(path_or_name), known)})" if known else "a scene file"
             raise SceneError(f"{path}: no such scene; expected {hint}")
         path = bundled[str(path_or_name)]

@@ -366,14 +366,14 @@ class Recover(Stage):
         at_once = waits or now.frames <= EVERY_FRAME
         # On CUDA and in real time, Python's lock limits the frame rate, and a solution in this process would hold it.
         # On CPU the frames use all cores. The solution is bit-identical in either process.
-        beside = self._real_time or not (waits or self._on_cpu)
-        if beside:
+        background = self._real_time or not (waits or self._on_cpu)
+        if background:
             solving.PROCESS.prepare()
         # If a frame waits, a running solver process is used; starting one takes longer than most clips.
-        beside = solving.PROCESS.ready if waits else beside and not at_once
+        background = solving.PROCESS.ready if waits else background and not at_once
         # On CPU the frame constants are not copied: the next frame overwrites the camera's place during the solution.
         camera = self._camera_place() if self._on_cpu else None
-        now.pending = self._worker.submit(self._solve, now.solver, beside, camera)
+        now.pending = self._worker.submit(self._solve, now.solver, background, camera)
         if at_once:
             self._take(None)
 
@@ -386,14 +386,14 @@ class Recover(Stage):
         """Return the camera's position when the equations were set up, metres, (3,)."""
         return np.asarray(self._camera.fetched()["params"]["camera_position"][0], np.float64).copy()
 
-    def _solve(self, solver: recovery.Recovery, beside: bool, camera: npt.NDArray[np.float64] | None) -> _Solved:
-        """Solve on the worker thread or, if ``beside``, in a separate process.
+    def _solve(self, solver: recovery.Recovery, background: bool, camera: npt.NDArray[np.float64] | None) -> _Solved:
+        """Solve on the worker thread or, if ``background``, in a separate process.
 
         The equations are not overwritten before this is done: the estimate takes effect before the next one begins.
 
         Args:
             solver: Solver with its state so far.
-            beside: Whether to solve in the separate process.
+            background: True to solve in the separate process.
             camera: Camera position, if it was read already; None: read it from the frame constants.
 
         Raises:
@@ -406,7 +406,7 @@ class Recover(Stage):
             camera = self._camera_place() if camera is None else camera
             self._transfers.fetch(self._stream, self._stream)
             sides = cells, *self._transfers.fetched().values(), observations, camera
-            if beside:
+            if background:
                 solver, estimate = solving.PROCESS.update(solver, sides, self._trace)
             else:
                 estimate = solving.update(solver, sides, self._trace)

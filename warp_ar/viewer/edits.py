@@ -454,7 +454,7 @@ def moved(value: _T, place: Callable[[Path], Path]) -> _T:
     return dataclasses.replace(value, **changes)
 
 
-def beside(scene: Scene, folder: Path) -> Scene:
+def with_bare_names(scene: Scene, folder: Path) -> Scene:
     """Return the scene with the paths of files in ``folder`` shortened to their names."""
     return moved(scene, lambda path: Path(path.name) if path.is_relative_to(folder) else path)
 

@@ -163,7 +163,7 @@ class Host:
         """Newest copy of the environment with its status; None while unknown."""
         if by_card:
             self._setup.step("light")
-        self._dropped, self._dropping = DroppedFiles(folder), threading.Lock()
+        self._uploads, self._uploading = DroppedFiles(folder), threading.Lock()
         self._doing: dict[str, Callable[..., None]] = {
             "undo": controls.undo,
             "redo": controls.redo,
@@ -287,8 +287,8 @@ class Host:
         Raises:
             WarpArError: The file cannot be used; nothing has changed.
         """
-        with self._dropping:
-            make, label, words = self._dropped.take(name, data, self._controls.wanted)
+        with self._uploading:
+            make, label, words = self._uploads.take(name, data, self._controls.wanted)
             self._controls.change(make, label)
         return words
 
@@ -347,7 +347,7 @@ class Host:
         """
         scene = make_target(self._controls.wanted, self._controls.feed).scene
         # Measured and dropped files are named as files of the scene's own folder, where users will save them.
-        scene = edits.beside(scene, Path(self._folder.name))
+        scene = edits.with_bare_names(scene, Path(self._folder.name))
         folder = None if full_paths or scene.path is None else scene.path.parent
         return dumps_scene(dataclasses.replace(scene, path=None), folder)
 

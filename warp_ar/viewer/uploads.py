@@ -24,7 +24,7 @@ from warp_ar.errors import SceneError, SinkError, UsageError, WarpArError, reaso
 from warp_ar.files import read_bytes
 from warp_ar.light.captured import Light
 from warp_ar.scene import CapturedLight, Object, Scene, dumps_scene, load_scene, loads_scene
-from warp_ar.scene.mesh_files import MESH_SUFFIXES, files_beside, load_mesh
+from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh, referenced_files
 from warp_ar.scene.mesh_source import confine
 from warp_ar.scene.scene_files import SceneFiles, files_of
 from warp_ar.viewer.edits import Wanted, add_item, moved
@@ -63,7 +63,7 @@ def pack_scene(scene: Scene) -> bytes:
         places[path] = Path(inside)
         members[str(inside)] = read_bytes(path, "mesh_bytes", SceneError)
         if path.suffix.lower() in MESH_SUFFIXES:
-            members |= {str(folder / _beside(name)): data for name, data in files_beside(path).items()}
+            members |= {str(folder / _packed_path(name)): data for name, data in referenced_files(path).items()}
     text = dumps_scene(dataclasses.replace(moved(scene, lambda path: places.get(path, path)), path=None))
     head = "# With all that it names but its frames: python -m warp_ar.live FOLDER --source PATH|INDEX\n"
     packed = io.BytesIO()
@@ -122,7 +122,7 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
         raise UsageError(f"{name}: {_shown(min(both))} is a file and a folder")
 
 
-def _beside(name: str) -> str:
+def _packed_path(name: str) -> str:
     """Return the relative path at which a mesh's own file is packed: as the mesh names it, if that is safe."""
     plain = name.strip().replace("\\", "/")
     inside = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", plain) and ".." not in PurePosixPath(plain).parts
