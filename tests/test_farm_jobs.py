@@ -145,7 +145,7 @@ ADAPTING = SCENE.format(source="", rest='[exposure]\nscale = "auto"')
 @pytest.mark.parametrize(
     ("scene", "run", "told"),
     [
-        (AUTOMATIC, "", 'says source.metering = "automatic", and its drift is told from all frames before; expected'),
+        (AUTOMATIC, "", 'says source.metering = "automatic", whose drift is measured from all earlier frames'),
         (AUTOMATIC, 'light = "preroll"\nsegment_frames = 4', 'expected run.light = "preroll" without segment_frames'),
         (AUTOMATIC, 'light = "preroll"', None),
         (ADAPTING, "segment_frames = 4", 'says exposure.scale = "auto", which adapts from frame to frame; expected no'),

@@ -124,7 +124,7 @@ def test_axes_of_an_openexr(
         write(path, gradient(), **({"envmap": OpenEXR.ENVMAP_LATLONG} if kept == "envmap" else {}))
         expected = from_axes(gradient(), "y-up")
     np.testing.assert_array_equal(load(path), expected)
-    assert ("y-up is taken" in capsys.readouterr().err) == (kept != "own")
+    assert ("y-up is assumed" in capsys.readouterr().err) == (kept != "own")
     for axes in AXES:
         np.testing.assert_array_equal(load(path, axes=axes), from_axes(load(path, axes="z-up"), axes))
 
@@ -135,7 +135,7 @@ def test_radiance_files_are_read_as_blender_does(tmp_path: pathlib.Path, capsys:
     # RGBE keeps 8 bits of a pixel's brightest channel.
     np.testing.assert_allclose(Light.load(path).radiance, gradient(), atol=2.0 / 128)
     np.testing.assert_allclose(read_environment(path), gradient(), atol=2.0 / 128)
-    assert "blender is taken" in capsys.readouterr().err
+    assert "blender is assumed" in capsys.readouterr().err
 
 
 def test_a_map_whose_quarter_is_half_a_column_is_turned(tmp_path: pathlib.Path) -> None:
