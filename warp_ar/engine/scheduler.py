@@ -254,10 +254,10 @@ class Scheduler:
             receive: Called when the stages to run are known, before anything is launched.
         """
         self.prepare()
-        due, timings = self._choose()
-        if receive is not None:
-            receive()
         try:
+            due, timings = self._choose()
+            if receive is not None:
+                receive()
             if not due:
                 times: Mapping[str, float] = {}
             elif not self._on_cpu:
