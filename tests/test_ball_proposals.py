@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.photo_room import exposed, photograph, sphere
-from warp_ar.ball.ball_finder import find_ball, lifted, silhouette
+from warp_ar.ball.ball_finder import MISFIT, find_ball, lifted, silhouette
 from warp_ar.ball.ball_proposals import propose_circles
 from warp_ar.errors import UsageError
 
@@ -106,7 +106,28 @@ def test_what_may_be_no_ball_is_doubtful(seed):
         cv2.fillPoly(picture, [corners.astype(np.int32)], random.integers(40, 220, 3).tolist())
     picture = cv2.GaussianBlur(picture, (0, 0), 0.7)
     with contextlib.suppress(UsageError):
-        assert find_ball(picture).is_doubtful
+        assert find_ball(picture).doubts
+
+
+def test_a_wheel_is_no_ball():
+    """Its rim is as sharp and as round as a ball's; its spokes run along the radius."""
+    picture = disc((320, 420), (210.0, 160.0, 100.0))
+    for angle in np.arange(12) * np.pi / 6:
+        end = (round(210 + 90 * np.cos(angle)), round(160 + 90 * np.sin(angle)))
+        cv2.line(picture, (210, 160), end, (20, 20, 20), 5, cv2.LINE_AA)
+    cv2.circle(picture, (210, 160), 97, (30, 30, 30), 7, cv2.LINE_AA)
+    found = find_ball(cv2.GaussianBlur(picture, (0, 0), 0.7), rough=(210.0, 160.0, 100.0))
+    assert found.misfit > MISFIT
+
+
+def test_an_ellipse_under_an_unknown_perspective_is_doubtful():
+    """No circle is within a fortieth of the radius of it; of the ball itself, one is."""
+    large = cv2.resize(room(), None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
+    wide = cv2.resize(large, None, fx=1.12, fy=1.0, interpolation=cv2.INTER_CUBIC)
+    round_one, oval = find_ball(large), find_ball(wide)
+    assert round_one.stray < 0.5 * oval.stray
+    assert round_one.misfit < MISFIT
+    assert any("edges lie" in doubt for doubt in oval.doubts)
 
 
 def test_a_rough_circle_in_the_dark():

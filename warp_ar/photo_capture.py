@@ -143,10 +143,10 @@ def capture_light(
             f"{reference.name} shows no rim of the ball: this outline is that of {taken_from.name}, at the same place; "
             "if the camera moved in between, show a brighter photograph (--shown)"
         )
-    if outline.is_doubtful:
+    if outline.doubts:
         notes.append(
-            "this outline is doubtful: look at its picture; if it is wrong, give a rough circle (--ball) or an exact "
-            "one (--circle)"
+            f"this outline is doubtful ({'; '.join(outline.doubts)}): look at its picture; if it is wrong, give a "
+            "rough circle (--ball) or an exact one (--circle)"
         )
     if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
         notes.append("the ball's picture shows no reflections: is a ball there, uncovered and polished?")

@@ -29,6 +29,7 @@ from warp_ar.ball.ball_rim import (
     gather_evidence,
     gather_steps,
     gradients,
+    mirror_misfit,
     radial_compression,
 )
 from warp_ar.errors import UsageError
@@ -57,12 +58,22 @@ TINY = 24.0
 """Radius in pixels below which many objects resemble a ball."""
 SEARCHES = 16
 """Number of proposed circles from which a ball is searched in a whole picture."""
-CERTAIN = 9.0
+CERTAIN = 9.8
 """Evidence above which no further circle is examined; most pictures of a ball reach it, few others do."""
 LEAST_EVIDENCE = 6.0
 """Smallest evidence for a ball. Between it and ``CERTAIN``, a person should check the result, which is mostly right."""
 UNSURE = 0.02
 """Largest standard deviation of position and radius, relative to the radius, of an outline without doubt."""
+STRAY = 0.026
+"""Largest stray of an outline without doubt, relative to the radius."""
+STRAY_PIXELS = 2.0
+"""Stray in pixels below which it is noise."""
+STRAY_REACH = 0.08
+"""Distance from an outline, relative to the radius, in which other edges are searched."""
+STRAY_RADIUS = 160.0
+"""Radius in pixels of the ball in the picture in which they are searched."""
+MISFIT = 0.6
+"""Largest misfit of a mirror ball."""
 DARK = 6.0
 """Code below which a lifted picture is not logarithmic, because of noise."""
 LARGEST_RADIUS = 700.0
@@ -103,13 +114,22 @@ class BallOutline:
     """Centre of the ball in the camera's frame, divided by its radius."""
     evidence: float = math.inf
     """Similarity to a mirror ball if the whole picture was searched; else infinite."""
+    stray: float = 0.0
+    """Largest distance in pixels to ellipses that have as many steps across them."""
+    misfit: float = 0.0
+    """Difference of the compression inside from a mirror ball's (``mirror_misfit``)."""
 
     @property
-    def is_doubtful(self) -> bool:
-        """Return True if another object may have been taken for the ball; most such outlines are still right."""
+    def doubts(self) -> tuple[str, ...]:
+        """Return reasons for which the outline may be wrong, or another object's; most such outlines are right."""
         dim = self.support < DIM_SUPPORT or self.radius < TINY
-        searched = math.isfinite(self.evidence) and (self.evidence < CERTAIN or dim)
-        return searched or max(self.deviation) > UNSURE * self.radius
+        reasons = {
+            "little of it is seen": math.isfinite(self.evidence) and (self.evidence < CERTAIN or dim),
+            "it is uncertain": max(self.deviation) > UNSURE * self.radius,
+            f"edges lie up to {self.stray:.0f} pixels from it": self.stray > max(STRAY * self.radius, STRAY_PIXELS),
+            "its inside is unlike a mirror ball's": self.misfit > MISFIT,
+        }
+        return tuple(reason for reason, holds in reasons.items() if holds)
 
     @property
     def radius(self) -> float:
@@ -198,6 +218,8 @@ class _Fit:
         self.base = base
         self.steps = _steps(camera, base)
         self.points, self.normals = silhouette(camera, base)
+        nx, ny = self.normals.T
+        self.basis = np.stack([nx, ny, np.ones_like(nx), nx * nx - ny * ny, 2.0 * nx * ny])
         self.radius = float(np.linalg.norm(self.points - self.points.mean(0), axis=1).mean())
         if blur is None:
             self.evidence = gather_steps(image, self.points, self.normals, self.radius, shift=shift)
@@ -205,8 +227,11 @@ class _Fit:
             self.evidence = gather_evidence(image, self.points, self.normals, self.radius, shift=shift, blur=blur)
 
     def shifts(self, moves: Array) -> Array:
-        """Return shifts along the normals, pixels (m, n), of an outline moved by (right, down, outward), (m, 3)."""
-        return np.asarray(moves[:, :2] @ self.normals.T + moves[:, 2:])
+        """Return shifts along the normals, pixels (m, n), of an outline after moves (m, 3 or 5).
+
+        A move is right, down and outward, and the two components of an ellipse.
+        """
+        return np.asarray(moves @ self.basis[: moves.shape[1]])
 
     def costs(self, moves: Array, evidence: RimEvidence | None = None) -> Array:
         """Return the costs (m,) of moves (m, 3)."""
@@ -247,11 +272,16 @@ def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: flo
         parts = (moves[k : k + TOGETHER] for k in range(0, len(moves), TOGETHER))
         return np.concatenate([fit.costs(part) - COMPRESSION * compressions(part) for part in parts])
 
-    grid = np.arange(-math.ceil(shift / step), math.ceil(shift / step) + 1.0) * step
-    moves = np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
+    moves = _grid(shift, step)
     chosen = _apart(moves, costs(moves), 2.5 * step)
     found = [descend(costs, moves[k], 0.5 * step, 0.2) for k in chosen]
     return fit.spheres(min(found, key=lambda item: item[1])[0])
+
+
+def _grid(reach: float, step: float) -> Array:
+    """Return moves (m, 3) of up to ``reach`` pixels in each unknown."""
+    grid = np.arange(-math.ceil(reach / step), math.ceil(reach / step) + 1.0) * step
+    return np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
 
 
 def _apart(places: Array, costs: Array, distance: float) -> list[int]:
@@ -380,7 +410,7 @@ def find_ball(
     for view in (image, lifted(image)):
         outlines.append(refine_outline(view, camera, _coarse(view, camera, start, rough_error)))
         if outlines[-1].support >= LEAST_SUPPORT:
-            return outlines[-1]
+            return _examined(image, camera, outlines[-1])
     raise _unseen(max(outlines, key=lambda outline: outline.support), "give a circle that is nearer to the rim")
 
 
@@ -446,7 +476,25 @@ def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
     outline = dataclasses.replace(outline, evidence=told)
     if told < LEAST_EVIDENCE or outline.support < LEAST_SUPPORT:
         raise _unseen(outline, ask)
-    return outline
+    return _examined(image, camera, outline)
+
+
+def _examined(image: Image, camera: Camera, outline: BallOutline) -> BallOutline:
+    """Return an outline with its stray and its misfit.
+
+    Circles are tried all around. From the best of them and from the outline itself, ellipses are fitted to the steps:
+    a ball's outline is one under a perspective that is not the assumed one, and so are many objects'.
+    """
+    size = STRAY_RADIUS / max(outline.radius, STRAY_RADIUS)
+    small, view = _reduced(image, camera, size)
+    fit = _Fit(small, view, np.array(outline.sphere), math.ceil(STRAY_REACH * size * outline.radius))
+    moves = _grid(STRAY_REACH * fit.radius, 0.25 * STRAY_REACH * fit.radius)
+    circles = moves[_apart(moves, fit.costs(moves), 0.6 * STRAY_REACH * fit.radius)]
+    starts = np.column_stack([np.concatenate([np.zeros((1, 3)), circles]), np.zeros((1 + len(circles), 2))])
+    ellipses = [descend(fit.costs, start, 0.4 * STRAY_REACH * fit.radius, 0.1) for start in starts]
+    rivals = np.array([move for move, cost in ellipses if cost <= ellipses[0][1]])
+    misfit = mirror_misfit(gradients(small), fit.points, fit.normals, fit.radius)
+    return dataclasses.replace(outline, stray=float(np.abs(fit.shifts(rivals)).max()) / size, misfit=misfit)
 
 
 def _refine_reduced(image: Image, camera: Camera, outline: BallOutline) -> BallOutline | None:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 
 import cv2
@@ -44,6 +45,8 @@ FINE_WINDOW = (2.0, 3.0)
 """Range in pixels inside and outside the rim for measurement; other reflections are close."""
 INNER_BAND, OUTER_BAND = (-0.16, -0.02), (0.03, 0.18)
 """Bands inside and outside a rim, relative to the radius, whose gradients are compared."""
+DISC_BANDS = (0.2, 0.4, 0.6, 0.75, 0.87, 0.97)
+"""Limits of the bands inside a rim, relative to the radius, in which reflections are compared with a mirror ball's."""
 FLAT = 1e-6
 """Squared gradient, per pixel of codes from 0 to 1, below which a picture is uniform."""
 NOISE = 1.5 / 255.0
@@ -243,12 +246,41 @@ def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Arra
         inside it.
     """
     bands = np.concatenate([np.linspace(low, high, 6) for low, high in (INNER_BAND, OUTER_BAND)])
-    reach = (radii[:, None] * bands)[:, None]
+    radial, tangential = _energies(slopes, points, normals, radii[:, None] * bands)
+    ratio = np.clip(np.log(radial / tangential), -3.0, 3.0).mean(1)
+    return np.asarray(ratio[:, :6].mean(1) - ratio[:, 6:].mean(1))
+
+
+def mirror_misfit(slopes: NDArray[np.float32], points: Array, normals: Array, radius: float) -> float:
+    """Return the root mean square by which the compression inside an outline differs from a mirror ball's.
+
+    At s radii from the centre, a ball compresses its reflections 1 / (1 - s^2) times as strongly along the radius as
+    along the rim. Blur and edges of finite length leave the square root of the ratio of energies, with the logarithm
+
+        -ln(1 - s^2).
+
+    A wheel's spokes, a coin's or a saucer's rings, and a print on a flat disc differ.
+
+    Args:
+        slopes: Result of ``gradients``.
+        points: Outline (n, 2), pixels.
+        normals: Outward unit normals (n, 2).
+        radius: Radius of the outline in pixels.
+    """
+    s = np.concatenate([np.linspace(low, high, 6) for low, high in itertools.pairwise(DISC_BANDS)])
+    energies = _energies(slopes, points[None], normals[None], radius * (s[None] - 1.0))
+    radial, tangential = (one[0].reshape(len(one[0]), -1, 6).mean(2) for one in energies)
+    ratio = np.clip(np.log(radial / tangential), -3.0, 3.0).mean(0)
+    off = ratio + np.log(1.0 - s * s).reshape(-1, 6).mean(1)
+    return float(np.sqrt((off * off).mean()))
+
+
+def _energies(slopes: NDArray[np.float32], points: Array, normals: Array, reach: Array) -> tuple[Array, Array]:
+    """Return radial and tangential energies, (m, n / 8, k), at ``reach`` (m, k) pixels outward from outlines."""
+    reach = reach[:, None]
     nx, ny = normals[..., 0, None], normals[..., 1, None]
-    shape = (len(points), points.shape[1], len(bands))
-    x, y = (
-        (points[..., k, None] + reach * n).astype(np.float32).reshape(-1, len(bands)) for k, n in ((0, nx), (1, ny))
-    )
+    shape = (len(points), points.shape[1], reach.shape[2])
+    x, y = ((points[..., k, None] + reach * n).astype(np.float32).reshape(-1, shape[2]) for k, n in ((0, nx), (1, ny)))
     slope = cv2.remap(slopes, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     dx, dy = slope[..., 0].reshape(shape), slope[..., 1].reshape(shape)
     pieces = shape[1] // 8
@@ -256,9 +288,7 @@ def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Arra
     def energy(v: Array) -> Array:
         return np.asarray((v * v)[:, : 8 * pieces].reshape(shape[0], pieces, 8, -1).mean(2) + FLAT)
 
-    radial, tangential = energy(dx * nx + dy * ny), energy(dy * nx - dx * ny)
-    ratio = np.clip(np.log(radial / tangential), -3.0, 3.0).mean(1)
-    return np.asarray(ratio[:, :6].mean(1) - ratio[:, 6:].mean(1))
+    return energy(dx * nx + dy * ny), energy(dy * nx - dx * ny)
 
 
 def descend(costs: Callable[[Array], Array], start: Array, step: float, least: float) -> tuple[Array, float]:
