@@ -9,7 +9,7 @@ import pytest
 from tests.test_drift import POSE, encode, linear_picture
 from tests.test_drift import SCENE as WITHOUT_ROOM
 from warp_ar import PRESETS, Pipeline
-from warp_ar.ball.ball_occlusion import PATIENCE, BallCover
+from warp_ar.ball.ball_occlusion import PATIENCE, BallOcclusion
 from warp_ar.calibration.saturation import ball_discs
 from warp_ar.scene import Pose, loads_scene
 from warp_ar.sources.deep_frame import Plate
@@ -56,19 +56,19 @@ def with_hand(linear, scene, hand=HAND):
 
 def watch(pictures, seconds=STEP, gains=None):
     scene = loads_scene(SCENE)
-    cover = BallCover(scene, scene.camera)
+    occlusion = BallOcclusion(scene, scene.camera)
     gains = [np.ones(3)] * len(pictures) if gains is None else gains
     return [
-        cover.observe(encode(one), [disc(scene)], POSE, seconds * index, gain)
+        occlusion.observe(encode(one), [disc(scene)], POSE, seconds * index, gain)
         for index, (one, gain) in enumerate(zip(pictures, gains, strict=True))
     ]
 
 
 def watch_plates(images, plates):
     scene = loads_scene(SCENE)
-    cover = BallCover(scene, scene.camera)
+    occlusion = BallOcclusion(scene, scene.camera)
     return [
-        cover.observe(image, [disc(scene)], POSE, STEP * index, np.ones(3), plate)
+        occlusion.observe(image, [disc(scene)], POSE, STEP * index, np.ones(3), plate)
         for index, (image, plate) in enumerate(zip(images, plates, strict=True))
     ]
 
@@ -125,12 +125,12 @@ def test_what_stays_is_believed():
 
 def test_a_frame_without_the_ball_in_it_is_no_cover():
     scene = loads_scene(SCENE)
-    cover = BallCover(scene, scene.camera)
+    occlusion = BallOcclusion(scene, scene.camera)
     image = encode(picture(scene))
     away = Pose(POSE.rotation, np.array([0.0, 5.0, 0.8]))
     for index, pose in enumerate((POSE, away, POSE)):
         discs = ball_discs(scene.probes, scene.camera, pose)
-        assert not cover.observe(image, discs, pose, STEP * index, np.ones(3))
+        assert not occlusion.observe(image, discs, pose, STEP * index, np.ones(3))
 
 
 def test_covered_frames_leave_the_light_alone(device):

@@ -68,7 +68,7 @@ DARK = 0.02
 """Radiance added before the logarithm, because darker values are noise."""
 
 
-class BallCover:
+class BallOcclusion:
     """Detector of occluded mirror balls over the frames."""
 
     def __init__(self, scene: Scene, camera: Camera) -> None:

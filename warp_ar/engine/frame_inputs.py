@@ -15,7 +15,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar import scene as scenes
-from warp_ar.ball.ball_occlusion import BallCover
+from warp_ar.ball.ball_occlusion import BallOcclusion
 from warp_ar.ball.reflectance_watch import ReflectanceWatch
 from warp_ar.calibration.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.device import exclusive
@@ -115,7 +115,7 @@ class FrameInputs:
         """Codes at which the channels saturate, estimated from the frames so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         watches_ball = watches_ball and scene.has_marker and bool(scene.probes)
-        self._cover = BallCover(scene, camera) if watches_ball else None
+        self._occlusion = BallOcclusion(scene, camera) if watches_ball else None
         self._reflectance = ReflectanceWatch(scene, camera, self.decode) if watches_ball else None
         self._coming: Slot | None = None
         self.covered = False
@@ -202,13 +202,14 @@ class FrameInputs:
         return np.asarray(self._drift.gain / gain), is_bent
 
     def continue_from(self, other: FrameInputs) -> None:
-        """Copy another pipeline's estimates of saturation, gain, tone curve, ball covering and reflectance."""
+        """Copy another pipeline's estimates of saturation, gain, tone curve, occlusion of balls and reflectance."""
         if self._camera == other._camera and not self._saturation_is_known:
             self.saturation = copy.deepcopy(other.saturation)
             self._saturation_is_known = other._saturation_is_known
             self._write_decode()
-        if self._cover is not None and other._cover is not None and self._cover.watches == other._cover.watches:
-            self._cover = copy.copy(other._cover)  # shallow: members are replaced, not modified
+        own, theirs = self._occlusion, other._occlusion
+        if own is not None and theirs is not None and own.watches == theirs.watches:
+            self._occlusion = copy.copy(theirs)  # shallow: members are replaced, not modified
         mine, yours = self._reflectance, other._reflectance
         if mine is not None and yours is not None and mine.watches == yours.watches:
             self._reflectance = copy.deepcopy(yours)
@@ -303,14 +304,14 @@ class FrameInputs:
 
     def _is_covered(self, frame: SeenFrame, *, reset: bool) -> bool:
         """Return True if something covers a ball; False if the frame is not on the host."""
-        if self._cover is None or frame.pose is None or isinstance(frame.image, wp.array):
+        if self._occlusion is None or frame.pose is None or isinstance(frame.image, wp.array):
             return False
         if reset:
-            self._cover.forget()
-        if self._cover.rests(frame.seconds):
-            return self._cover.is_covered
+            self._occlusion.forget()
+        if self._occlusion.rests(frame.seconds):
+            return self._occlusion.is_covered
         discs = ball_discs(self._probes, self._camera, frame.pose)
-        return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
+        return self._occlusion.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
 
     def _note_reflectance(self, frame: SeenFrame, pose: Pose) -> bool:
         """Update the estimate of the balls' reflectance; return True if the values in use changed."""
