@@ -33,7 +33,7 @@ DEVICES = Path("/dev")
 FEW_SIDES = 5
 """Directions from which a table must be seen to measure its reflection."""
 APART = 4.0
-"""Least angle between these directions, degrees."""
+"""Least angle between directions from which a table is seen, degrees."""
 MISLEADING = ("units.", "source.", "camera.", "marker.", "ball.outside", "ball.unfound", "ball.place", "ball.radius")
 """Prefixes of the names of findings that make measurements of the table's reflection unreliable."""
 STEP = 0.5

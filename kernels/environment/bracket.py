@@ -47,7 +47,7 @@ SHOT = wp.constant(wp.float32(0.0004))
 
 @wp.struct
 class BracketExposure:
-    """One of the exposures between which frames alternate."""
+    """Exposure of a bracketed source, whose frames alternate between several exposures."""
 
     ratio: wp.float32  # exposure time over the reference's
     trust: wp.float32  # 1; 0 if there was no such frame lately

@@ -111,7 +111,7 @@ def write_cut_kernel(
 
 
 write_cut = row_launcher(write_cut_kernel)
-"""Write the remainder that 8 bits cut off a frame's intensity, as a grey frame for a summed-area table of its own.
+"""Write the part of a frame's intensity that rounding to 8 bits removed, as a grey frame to sum separately.
 
 Args:
     frame: (H, W) vec3ub, RGB codes.

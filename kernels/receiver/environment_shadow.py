@@ -147,7 +147,7 @@ class ShadowQueue:
 
 @wp.func
 def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
-    """Return the share of the environment that objects do not hide, RGB, and the depth."""
+    """Return (R, G, B, depth): the share of the environment's irradiance that objects leave, per channel."""
     ratio = wp.vec4(1.0, 1.0, 1.0, depth)
     for channel in range(3):
         if without[channel] > MIN_IRRADIANCE:

@@ -34,7 +34,7 @@ LEAST_SHARE = wp.constant(wp.float32(0.1))
 LEAST_POINTS = wp.constant(wp.int32(8))
 """Least number of the card's points that both frames show."""
 AGREEING = wp.constant(wp.float32(0.7))
-"""Least share of these points whose ratio of radiance agrees with the median."""
+"""Least share of the card's points whose ratio of radiance agrees with the median."""
 SPREAD = wp.constant(wp.float32(0.1))
 """Largest relative difference of a ratio that agrees with the median."""
 MOST = wp.constant(wp.float32(1.5))

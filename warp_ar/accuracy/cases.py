@@ -26,9 +26,9 @@ Mask = npt.NDArray[np.bool_]
 LIGHT_RADIUS = 0.02
 """Radius in metres of the lights of ``sized_light``: a light bulb."""
 SIZED = ", sized light"
-"""Suffix of the names of such cases."""
+"""Suffix of the names of cases made by ``sized_light``."""
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
-"""Kinds of truth of a case; ``object`` and ``light`` are used only if there is no ``both``."""
+"""Kinds of true pictures of a case; ``object`` and ``light`` are used only if the case has no ``both``."""
 
 
 @dataclasses.dataclass(frozen=True)

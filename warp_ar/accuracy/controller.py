@@ -36,7 +36,7 @@ SETTLE = 2
 MEMORY = 60.0
 """Seconds for which settings that exceeded the budget are not tried again; doubled at each repetition."""
 MOST_DOUBLINGS = 6
-"""Largest number of doublings of that time, to about an hour."""
+"""Largest number of doublings of ``MEMORY``, to about an hour."""
 
 
 class Controller:

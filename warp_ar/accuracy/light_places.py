@@ -29,7 +29,7 @@ from warp_ar.scene import Pose, Scene
 WIDTH = 160
 """Width in pixels of the pictures in which reflectance is measured."""
 SAMPLES = 16
-"""Samples per pixel of these pictures."""
+"""Samples per pixel of the pictures in which reflectance is measured."""
 GRAIN = 0.1
 """Deviation of the logarithm of reflectance beyond which it has less weight: about that of wood or paper."""
 SHOWN = (0.01, 0.95)

@@ -57,7 +57,7 @@ DEFAULT_SAMPLES = 256
 LIGHT_SAMPLES = 32
 """Samples per pixel that estimate the reflectance of proxies before the picture."""
 FIRST_LIGHT_SAMPLES = 4
-"""Number of these samples after which each proxy's mean reflectance is estimated."""
+"""Number of ``LIGHT_SAMPLES`` after which each proxy's mean reflectance is estimated."""
 UNKNOWN_REFLECTANCE = 0.5
 """Reflectance of a proxy that is visible in no pixel."""
 DFG_SIZE = 32

@@ -72,13 +72,13 @@ INSIDE = 0.95
 WATCHED = 24
 """Number of first frames of a camera that are all measured."""
 PERIOD = 12
-"""Interval, in frames, between later measurements."""
+"""Interval, in frames, between measurements after the first ``WATCHED`` frames."""
 WIDTH = 1
 """Number of codes on either side that belong to a plateau."""
 WIDE = 2
 """Number of codes on either side of a luma plateau after strong compression."""
 NEUTRAL_WIDE = 6.0
-"""Largest distance, in codes, of the median pixel of such a plateau; chroma is compressed more strongly than luma."""
+"""Largest distance, in codes, of the median pixel of a wide luma plateau; chroma is compressed more than luma."""
 LOPSIDED = 0.7
 """Largest ratio of pixels above a wide plateau to pixels in as many codes below it; a lit surface has a ratio of 1."""
 TOP = 3
@@ -86,7 +86,7 @@ TOP = 3
 TOP_SHARE = 0.02
 """Smallest share of the ball's pixels on a blurred plateau."""
 TOP_STEEP = 2.0
-"""Smallest ratio of its pixels to those of as many codes below it."""
+"""Smallest ratio of a blurred plateau's pixels to those of as many codes below it."""
 STILL = 4
 """Largest range, in codes, of a plateau over time."""
 MOVED = 0.25
@@ -94,8 +94,8 @@ MOVED = 0.25
 MOVED_FRAMES = 4
 """Smallest number of usable frames."""
 HELD_HEAP = 2e-3
-"""Share of the whole picture with codes 254 and 255 above which an accepted level is withdrawn; sharpening and
-compression cause some such pixels."""
+"""Share of pixels with codes 254 and 255 that disproves a lower saturation level found before. Sharpening and
+compression cause smaller shares."""
 
 
 class SaturationLevels:

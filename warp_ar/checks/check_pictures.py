@@ -291,7 +291,7 @@ class FocalFit:
     views: int
     """Number of frames used."""
     gain: float
-    """Ratio of squared residuals for the camera's focal length to the smallest ones."""
+    """Sum of squared residuals for the camera's focal length, relative to that of the best focal length."""
 
 
 def measure_focal(marker: Marker, look: Look) -> FocalFit | None:

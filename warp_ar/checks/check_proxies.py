@@ -32,7 +32,7 @@ PIXELS: Final = 5.0
 ON: Final = 0.6
 """Share of matching samples from which a shape is right."""
 BETTER: Final = 0.15
-"""Smallest increase of that share at a displaced position."""
+"""Smallest increase of the share of matching samples at a displaced position."""
 FEWEST: Final = 2
 """Number of views that must agree, or all if there are fewer."""
 STEP: Final = 6.0

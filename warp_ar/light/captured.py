@@ -65,7 +65,7 @@ class Light:
     """Light of an environment, with its confidence, its emitters and its limits."""
 
     radiance: Map
-    """Linear RGB, float32 (height, 2 height, 3), in camera values of the exposure that was shown."""
+    """Linear RGB, float32 (height, 2 height, 3), in camera values of the shown photograph's exposure."""
     confidence: Map
     """Confidence of each texel, 0 to 1, float32 (height, 2 height)."""
     emitters: tuple[CapturedEmitter, ...] = ()

@@ -39,7 +39,7 @@ ROWS: Final = 8
 SIDES: Final = (0.9, 0.3)
 """Prior share of the card's light from near the horizon: without a visible face of a box, and with one."""
 NEAR_HORIZON: Final = 0.25
-"""Sine of the height above the horizon at which that light has fallen to 1 / e."""
+"""Sine of the height above the horizon at which the light from near the horizon has fallen to 1 / e."""
 SPREAD: Final = (0.7, 0.4)
 """Prior relative standard deviation of a cell above and below the horizon."""
 REACH: Final = 0.8

@@ -71,7 +71,7 @@ class PriorConfig:
     exponent: float = -0.5
     """Exponent of the solid angle in a component's expected radiance."""
     least_alike: float = 0.05
-    """Least ratio of a component's expected missing light to that of one clipped in all channels."""
+    """Least expected missing light of a component, relative to a component that clips in all channels."""
     fades: tuple[float, float] = (0.6, 0.7)
     """Radiance next to clipped cells over clipping: boundaries are sharp below the first, faded at the second."""
     depth: float = 1.0
@@ -215,11 +215,11 @@ class ShadowConfig:
     near: float = 2.0
     """Distance in radii within which a ray passes close to the ball, for points next to the ball's shadow."""
     near_share: float = 0.5
-    """Least share of such rays in the light added at a tested point."""
+    """Least share of rays within ``near`` in the light added at a tested point."""
     across: float = 3.5
     """Distance in radii within which a ray passes the ball, for points that measure the shadow's contrast."""
     elsewhere: float = 0.1
-    """Largest share of such rays at points that measure the plane's brightness outside the shadow."""
+    """Largest share of rays within ``near`` or ``across`` at points outside the shadow, which measure its plane."""
     points: int = 8
     """Least number of points next to the shadow, and of those outside it."""
     believed: float = 0.1

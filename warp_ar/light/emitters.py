@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 STEP = 1.1
 """Ratio of neighbouring trial distances."""
 MOST_STEPS = 4
-"""Largest number of such steps from the result of the grid search."""
+"""Largest number of steps of ``STEP`` from the result of the grid search."""
 
 
 def room(distance: float) -> float:

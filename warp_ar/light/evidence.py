@@ -113,9 +113,9 @@ def irradiance_form(problem: Problem, normals: Array) -> Array:
 
 
 def greyer(contrast: float, white: float) -> float:
-    """Return the factor by which light may exceed the card's estimate if the paper is greyer than stated; at least 1.
+    """Return the factor, at least 1, by which light may exceed the card's estimate because the paper is greyer.
 
-    The reflectance of paper is its contrast times that of ink, and prints have a usual reflectance of ink.
+    The paper's reflectance is estimated as the contrast of paper to ink times the usual reflectance of printed ink.
 
     Args:
         contrast: Ratio of unclipped paper to adjacent ink.

@@ -108,9 +108,10 @@ WHOLE = 0.9
 
 
 def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], count: int) -> Array:
-    """Return the expected missing light of each component relative to one with all channels clipped, (count,).
+    """Return the expected missing light of each component, relative to a component clipped in all channels, (count,).
 
-    It is the squared share of its clipped solid angle in which all channels clip, and at least ``least_alike``.
+    The value is the square of the share of clipped solid angle in which all channels clip, and at least
+    ``least_alike``.
 
     Args:
         clipped: Clipped share of cells, per channel, (m, 3).

@@ -177,8 +177,8 @@ class ThreadedSink(Sink):
 def _started_pool(threads: int) -> ThreadPoolExecutor:
     """Return an executor whose threads have all been started.
 
-    An executor starts threads on demand. If a signal interrupts that, it forgets the running thread and starts another
-    one beside it. Here no frame is waiting yet, so none can be lost.
+    An executor starts threads on demand. A signal that interrupts this start makes it forget the running thread and
+    start a second one. Starting all threads here, before the first frame, cannot lose a frame.
     """
     pool, everyone = ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-sink"), threading.Event()
     try:

@@ -111,7 +111,7 @@ class MirrorBall(Stage):
         return Wiring(tuple(sorted(_reads(features, lit=features.lit))), ("mirror_ball",))
 
     def idle(self, reach: Reach) -> str | None:
-        """Return a reason if no ball is in the picture; reflected content may lie outside it."""
+        """Return the reason why no ball shows a change; None if one may, also by objects outside the picture."""
         if not reach.balls:
             return "no mirror ball is in the picture"
         dark = not reach.falls and not self.request.scene.objects

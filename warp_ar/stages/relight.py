@@ -38,7 +38,7 @@ class Grain:
 
 
 GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
-"""Resolutions by method of ``features.LOCAL``, whose methods otherwise equal ``reflectance``."""
+"""Resolutions of the methods with local light; otherwise these methods equal ``reflectance``."""
 
 
 class Relight(Stage):

@@ -52,8 +52,8 @@ AGREEING = 0.7
 SPREAD = 0.3
 """Largest deviation from the median, as a share of the median's magnitude."""
 FURTHEST = 0.06
-"""Upper bound on that deviation, as a logarithm: a distant emitter that changes affects nearby surfaces almost equally,
-beyond this bound."""
+"""Upper bound on the allowed deviation from the median, as a logarithm. A distant emitter that changes affects nearby
+surfaces almost equally; their deviations exceed this bound."""
 NOISE = 0.09
 """Allowed deviation once a drift is known, as a logarithm: covers tone curve, blurred texture, noise and
 compression."""

@@ -26,7 +26,7 @@ CORRELATED: Final = 2.0
 _TAPS: Final = np.linspace(-1.0, 1.0, 9)
 """Positions across an edge at which the picture is sampled, relative to the reach."""
 _WEIGHTS: Final = np.array([0.125, *([0.25] * 7), 0.125])
-"""Weights of the trapezoid rule for these positions."""
+"""Weights of the trapezoid rule for the positions ``_TAPS``."""
 _CLEARANCE: Final = 0.45
 """Sampled share of the distance to the nearest parallel edge."""
 _MIN_REACH: Final = 1.0
@@ -38,8 +38,7 @@ _LEAST_CONTRAST: Final = 1e-4
 _MIN_EDGES: Final = 16
 """Smallest number of measured edge points: nine unknowns, and redundancy for outlier rejection."""
 _DONE: Final = 0.05
-"""Largest displacement of an edge in pixels in the last Gauss-Newton step; the next step would be about a tenth of
-it."""
+"""Displacement of edges, pixels, below which a Gauss-Newton step is the last; the next would move about a tenth."""
 _PRIOR: Final = np.diag([0.0] * 6 + [1.0] * 3)
 """Prior on the three shift parameters, which are a fraction of a pixel: without it, a print without inner edges could
 not separate shift from distance."""

@@ -39,7 +39,7 @@ STEP_SECONDS: Final = 0.4
 LOST_SECONDS: Final = 1.5
 """Time without the marker after which the reason is searched, seconds."""
 AGAIN_SECONDS: Final = 3.0
-"""Time between two such searches, and between two tests for a missing ball, seconds."""
+"""Time between two searches for the reason, and between two tests for a missing ball, seconds."""
 BALL_SECONDS: Final = 10.0
 """Time between two tests for a visible ball, seconds; each takes a third of a second."""
 PLACES_SECONDS: Final = 1.0
