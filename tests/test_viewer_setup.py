@@ -199,7 +199,7 @@ def measure_the_ball(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
     hands.look("ball")
     # What was measured is no longer said once it is undone.
     hands.page.keyboard.press("Control+z")
-    tab.until("document.getElementById('ball-note').textContent.startsWith('Centre and radius are solved')", "undone")
+    tab.until("document.getElementById('ball-note').textContent.startsWith('Centre and radius are measured')", "undone")
     hands.page.keyboard.press("Control+Shift+z")
     tab.until("document.getElementById('ball-note').textContent.startsWith('The ball')", "done again")
 
