@@ -27,7 +27,7 @@ import numpy as np
 
 from bench.bench_frame import SIZES, clip, stream_frames
 from bench.common import commit
-from warp_ar.engine.crew import Crew
+from warp_ar.engine.cpu_threads import CpuThreads
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import bands
 
@@ -46,9 +46,9 @@ class Watch:
         pipeline.warm_up()
         self._time(pipeline, "_look", "track")
         self._time(pipeline, "_render", "render")
-        crew = pipeline._scheduler._crew
-        if crew is not None:
-            self._follow(crew)
+        threads = pipeline._scheduler._cpu_threads
+        if threads is not None:
+            self._follow(threads)
 
     def _time(self, owner: Any, name: str, part: str) -> None:
         function = getattr(owner, name)
@@ -62,8 +62,8 @@ class Watch:
 
         setattr(owner, name, timed)
 
-    def _follow(self, crew: Crew) -> None:
-        run: Callable[..., Any] = crew.run
+    def _follow(self, threads: CpuThreads) -> None:
+        run: Callable[..., Any] = threads.run
 
         def followed(*due: Any) -> Any:
             begin = time.perf_counter()
@@ -71,12 +71,12 @@ class Watch:
             self.parts["native"].append((time.perf_counter() - begin) * 1e3)
             for name, nanoseconds in times.items():
                 self.stages[name].append(nanoseconds * 1e-6)
-            unsplit, path = least_times(crew)
+            unsplit, path = least_times(threads)
             self.parts["whole"].append(unsplit)
             self.parts["path"].append(path)
             return times
 
-        crew.run = followed  # type: ignore[method-assign]
+        threads.run = followed  # type: ignore[method-assign]
 
     def forget(self) -> None:
         """Leave out the frames so far."""
@@ -91,9 +91,9 @@ class Watch:
         return {"parts": {name: round(value, 3) for name, value in parts.items()}, "stages": stages}
 
 
-def least_times(crew: Crew) -> tuple[float, float]:
-    """Milliseconds of a crew's last frame in passes that cannot be split, and of its path with cores without end."""
-    table, stages = crew._passes, crew._stages
+def least_times(threads: CpuThreads) -> tuple[float, float]:
+    """Milliseconds of the last frame in passes that cannot be split, and of its path with cores without end."""
+    table, stages = threads._passes, threads._stages
     spent = table[:, bands.PASS.index("time")] * 1e-6
     whole = table[:, bands.PASS.index("whole")] == 1
     least = np.where(whole, spent, np.minimum(spent, bands.WORTH * 1e-6))
@@ -103,7 +103,7 @@ def least_times(crew: Crew) -> tuple[float, float]:
     begun = np.zeros(len(stages))
     for stage in range(len(stages)):  # in an order in which they may run
         done = begun[stage] + least[first[stage] : last[stage]].sum()
-        for other in crew._readers[reader[stage] : readers_end[stage]]:
+        for other in threads._readers[reader[stage] : readers_end[stage]]:
             begun[other] = max(begun[other], done)
     ends = [begun[stage] + least[first[stage] : last[stage]].sum() for stage in range(len(stages))]
     return float(spent[whole].sum()), float(max(ends))

@@ -1,7 +1,7 @@
 """The farm from file to file: frames a second by number of workers, or in turn with another checkout.
 
 ``python -m bench farm --device cpu --workers 1,2`` lights the bundled desk in segments and checks that the joined
-recordings are the same bytes. ``--beside DIR`` runs the same job file by the program of another checkout in turn, and
+recordings are the same bytes. ``--other DIR`` runs the same job file by the program of another checkout in turn, and
 prints the median of the paired ratios of frames a second.
 """
 
@@ -49,10 +49,10 @@ def main(device: str, arguments: Sequence[str] = ()) -> None:
     parser.add_argument("--workers", default="default", help="numbers with commas (default: the program's own)")
     parser.add_argument("--quality", default="medium")
     parser.add_argument("--segment", type=int, default=24, help="frames of a segment")
-    parser.add_argument("--beside", type=Path, metavar="DIR", help="another checkout, run in turn")
+    parser.add_argument("--other", type=Path, metavar="DIR", help="another checkout, run in turn")
     parser.add_argument("--turns", type=int, default=3)
     options = parser.parse_args(arguments)
-    roots = [ROOT] + ([options.beside] if options.beside else [])
+    roots = [ROOT] + ([options.other] if options.other else [])
     with tempfile.TemporaryDirectory(prefix="warp_ar-bench-") as name:
         jobs = Path(name) / "jobs.toml"
         jobs.write_text(JOBS.format(quality=options.quality, segment=options.segment), encoding="utf-8")
@@ -72,6 +72,6 @@ def main(device: str, arguments: Sequence[str] = ()) -> None:
                 "frames_per_second": [round(statistics.median(own), 2) for own in rates],
                 "equal_bytes": len(digests) == 1,
             }
-            if options.beside:
+            if options.other:
                 told["ratio"] = round(statistics.median(a / b for a, b in zip(*rates, strict=True)), 3)
             print(json.dumps(told), flush=True)

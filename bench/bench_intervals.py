@@ -32,7 +32,7 @@ from warp_ar.calibration.card import write_card
 from warp_ar.calibration.response import measure_grey_response
 from warp_ar.scene import Camera, Pose, Probe, Proxy
 from warp_ar.sources.sources import open_source
-from warp_ar.tracking.card_layout import SHEET, ball_center
+from warp_ar.tracking.card_layout import CARD_MARKER, ball_center
 
 SETUPS = 100
 VIEWS = 14
@@ -102,7 +102,7 @@ def responded(seed: int) -> Figures:
 def printed() -> Path:
     """The card as a PDF, which goes with the process."""
     path = Path(tempfile.mkdtemp()) / "card.pdf"
-    write_card(SHEET, path, "a4", 600)
+    write_card(CARD_MARKER, path, "a4", 600)
     return path
 
 
@@ -126,7 +126,7 @@ def measured(seed: int) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         film(desk, rng, Path(folder))
         with open_source(folder) as source:
-            views = posed_frames(source, SHEET, camera, FRAMES)
+            views = posed_frames(source, CARD_MARKER, camera, FRAMES)
     told = desk.radius * rng.uniform(0.92, 1.08)
     table = Proxy("plane", at=(0.0, 0.0, 0.0), size=(1.6, 1.2))
     found = measure_ball(views, camera, Probe(ball_center(told), told), (table,))

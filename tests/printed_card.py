@@ -36,7 +36,8 @@ class PrintedCard:
         self.black = rng.uniform(0.03, 0.1) if black is None else black
         self.spread = rng.normal(0.0, 0.015) if spread is None else spread
         width, height = (length / 1e3 for length in PAPERS[paper])
-        ink = 1.0 - card_layout.draw_sheet((width, height), PER_METRE, draw_card(card_layout.SHEET, PER_METRE)) / 255.0
+        board = draw_card(card_layout.CARD_MARKER, PER_METRE)
+        ink = 1.0 - card_layout.draw_page((width, height), PER_METRE, board) / 255.0
         # Ink spreads in the greys' dots alone: each patch gets what its share becomes.
         self.origin = np.array([width / 2, 0.052 + card_layout.BALL_PLACE[1] + (height - 0.2794) / 2]) * PER_METRE
         for share, center in zip(card_layout.GREYS, card_layout.grey_centers(), strict=True):

@@ -116,7 +116,7 @@ def _scene_radiance(room: Room, origin: Array, direction: Array, irradiance: Arr
 def _sheet(per_metre: int = 4000) -> tuple[NDArray[np.uint8], int]:
     """The card's print, 255 where it is white, and pixels per metre."""
     size = tuple(length / 1e3 for length in PAPERS["a4"])
-    return card_layout.draw_sheet(size, per_metre, draw_card(card_layout.SHEET, per_metre)), per_metre
+    return card_layout.draw_page(size, per_metre, draw_card(card_layout.CARD_MARKER, per_metre)), per_metre
 
 
 def _card_reflectance(p: Array) -> Array:

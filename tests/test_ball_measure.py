@@ -14,7 +14,7 @@ from warp_ar.ball.ball_measure import measure_ball
 from warp_ar.ball.ball_solve import APART, agreeing_outlines, find_outline, outline_misfit, solve_ball
 from warp_ar.calibration.card import write_card
 from warp_ar.scene import Pose, Probe, Proxy
-from warp_ar.tracking.card_layout import SHEET, ball_center
+from warp_ar.tracking.card_layout import CARD_MARKER, ball_center
 
 pytestmark = pytest.mark.slow
 
@@ -26,7 +26,7 @@ RADIUS = 0.4e-3
 @pytest.fixture(scope="module")
 def card(tmp_path_factory):
     path = tmp_path_factory.mktemp("card") / "card.pdf"
-    write_card(SHEET, path, "a4", 600)
+    write_card(CARD_MARKER, path, "a4", 600)
     return path
 
 

@@ -12,7 +12,7 @@ from warp_ar import PRESETS, Pipeline
 from warp_ar.ball.ball_occlusion import PATIENCE, BallOcclusion
 from warp_ar.calibration.saturation import ball_discs
 from warp_ar.scene import Pose, loads_scene
-from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.deep_frame import DeepFrame
 
 SCENE = WITHOUT_ROOM.replace("center = [0.0, 0.3, 0.03]\nradius = 0.03", "center = [-0.26, 0.0, 0.05]\nradius = 0.05")
 """The ball is in the picture."""
@@ -64,12 +64,12 @@ def watch(pictures, seconds=STEP, gains=None):
     ]
 
 
-def watch_plates(images, plates):
+def watch_deep(images, deep_frames):
     scene = loads_scene(SCENE)
     occlusion = BallOcclusion(scene, scene.camera)
     return [
-        occlusion.observe(image, [disc(scene)], POSE, STEP * index, np.ones(3), plate)
-        for index, (image, plate) in enumerate(zip(images, plates, strict=True))
+        occlusion.observe(image, [disc(scene)], POSE, STEP * index, np.ones(3), deep)
+        for index, (image, deep) in enumerate(zip(images, deep_frames, strict=True))
     ]
 
 
@@ -79,8 +79,8 @@ def test_a_white_hand_before_lamps_above_white_is_told_by_light():
     bare = picture(scene, mirrored=(4.0, 4.0, 4.0))
     frames = [bare, bare, with_hand(bare, scene, 0.9), bare]
     codes = [encode(frame) for frame in frames]
-    assert watch_plates(codes, [Plate(frame.astype(np.float32)) for frame in frames]) == [False, False, True, False]
-    assert watch_plates(codes, [None] * 4) == [False] * 4, "8 bits do not hold it"
+    assert watch_deep(codes, [DeepFrame(frame.astype(np.float32)) for frame in frames]) == [False, False, True, False]
+    assert watch_deep(codes, [None] * 4) == [False] * 4, "8 bits do not hold it"
 
 
 def test_a_hand_is_told_while_it_is_there():

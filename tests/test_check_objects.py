@@ -35,7 +35,7 @@ from warp_ar.scene import (
     object_from_trimesh,
 )
 from warp_ar.scene.object_materials import mesh_of
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 
 CAMERA = Camera(64, 48, 64.0, 64.0, 31.5, 23.5)
 AHEAD = Pose(np.eye(3), np.zeros(3))
@@ -145,9 +145,9 @@ def findings(paper, scale, told=1.0, seed=0):
         eye = np.array([0.12 * (k - 1), -0.42, 0.5 + 0.04 * k])
         pose = Pose(*look_at(eye, np.array([0.0, 0.02, 0.0])))
         images.append((card.photograph(CAMERA_CHECK_PRINT, pose, 0.7, encode), k / 24))
-    board = SHEET.board
+    board = CARD_MARKER.board
     lengths = (board.square_length * told, board.marker_length * told)
-    marker = dataclasses.replace(SHEET, board=CharucoBoard(board.columns, board.rows, *lengths))
+    marker = dataclasses.replace(CARD_MARKER, board=CharucoBoard(board.columns, board.rows, *lengths))
     look = look_over(marker, CAMERA_CHECK_PRINT, images)
     assert len(look.views) == 3
     return check_print(marker, CAMERA_CHECK_PRINT, look.views)
@@ -171,8 +171,8 @@ def test_what_the_scene_says_is_no_finding(paper, scale, told):
 
 def test_other_markers_have_no_known_paper():
     assert card_scale(Marker()) is None
-    assert card_scale(SHEET) == 1.0
-    assert card_scale(dataclasses.replace(SHEET, dictionary="DICT_5X5_50")) is None
+    assert card_scale(CARD_MARKER) == 1.0
+    assert card_scale(dataclasses.replace(CARD_MARKER, dictionary="DICT_5X5_50")) is None
 
 
 # --- The quick half of the checks tells where a mirror ball was seen --------------------------------------------------

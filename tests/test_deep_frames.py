@@ -22,7 +22,7 @@ from warp_ar.output.encoders import parse_options
 from warp_ar.output.sinks import open_sink
 from warp_ar.session import Session
 from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
-from warp_ar.sources.deep_frame import Plate, srgb8
+from warp_ar.sources.deep_frame import DeepFrame, srgb8
 from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS
 
@@ -90,11 +90,11 @@ def test_a_standard_video_keeps_its_codes(tmp_path: pathlib.Path, bits: int) -> 
     planes = planes_of(bits)
     deep, frame = read_one(write_yuv(tmp_path / "a.mkv", planes, bits, TAGS["sdr"]))
     assert deep == "codes"
-    assert frame.plate.picture.dtype == np.uint16
+    assert frame.deep.picture.dtype == np.uint16
     expected = signal_of(planes, bits, 1)
-    np.testing.assert_allclose(frame.plate.picture * STEP16, expected, atol=HALF_STEP16 + FLOAT32)
+    np.testing.assert_allclose(frame.deep.picture * STEP16, expected, atol=HALF_STEP16 + FLOAT32)
     # Neighbouring steps of the ramp stay apart, which 8 bits would not keep.
-    assert len(np.unique(frame.plate.picture[0, :, 1])) == SIZE[0]
+    assert len(np.unique(frame.deep.picture[0, :, 1])) == SIZE[0]
     assert np.abs(frame.image / 255.0 - expected).max() < 1.6 / 255.0
 
 
@@ -108,10 +108,10 @@ def test_hdr_video_becomes_light(tmp_path: pathlib.Path, kind: str, curve: Any) 
     # The table has 65536 steps of the signal: half a step on the curve, mixed by the matrix (largest row sum 2.3).
     slope = 2.4 * (curve(np.minimum(signal + HALF_STEP16, 1.0)) - curve(np.maximum(signal - HALF_STEP16, 0.0)))
     bound = slope.max(-1, keepdims=True) + 1e-5 * (1.0 + light.max(-1, keepdims=True))
-    assert (np.abs(frame.plate.picture - light) <= bound).all()
-    assert frame.plate.picture.max() > 3.0, "highlights are above reference white"
-    np.testing.assert_array_equal(frame.image, srgb8(frame.plate.picture))
-    assert math.isinf(frame.plate.clip) if kind == "pq" else 3.5 < frame.plate.clip < 3.8
+    assert (np.abs(frame.deep.picture - light) <= bound).all()
+    assert frame.deep.picture.max() > 3.0, "highlights are above reference white"
+    np.testing.assert_array_equal(frame.image, srgb8(frame.deep.picture))
+    assert math.isinf(frame.deep.clip) if kind == "pq" else 3.5 < frame.deep.clip < 3.8
 
 
 def test_wide_primaries_are_converted(tmp_path: pathlib.Path) -> None:
@@ -120,7 +120,7 @@ def test_wide_primaries_are_converted(tmp_path: pathlib.Path) -> None:
     assert deep == "light"
     p3 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
     light = decode_codes("srgb", signal_of(planes, 10, 1).reshape(-1))[:, 0].reshape(SIZE[1], SIZE[0], 3)
-    np.testing.assert_allclose(frame.plate.picture, light @ rgb_from_rgb(p3, REC_709).T, atol=6e-5)
+    np.testing.assert_allclose(frame.deep.picture, light @ rgb_from_rgb(p3, REC_709).T, atol=6e-5)
 
 
 def write_exr_picture(path: pathlib.Path, pixels: np.ndarray, **header: Any) -> None:
@@ -143,11 +143,11 @@ def test_openexr_is_light(tmp_path: pathlib.Path, kind: type) -> None:
         source.keeps_depth = True
         assert (source.deep, source.length, source.size) == ("light", 3, SIZE)
         for frame in source:
-            np.testing.assert_array_equal(frame.plate.picture[1:], pixels[1:].astype(np.float32))
-            np.testing.assert_array_equal(frame.plate.picture[0, :3, 0], np.float32([0.0, 65504.0, -0.5]))
-            np.testing.assert_array_equal(frame.image, srgb8(frame.plate.picture))
+            np.testing.assert_array_equal(frame.deep.picture[1:], pixels[1:].astype(np.float32))
+            np.testing.assert_array_equal(frame.deep.picture[0, :3, 0], np.float32([0.0, 65504.0, -0.5]))
+            np.testing.assert_array_equal(frame.image, srgb8(frame.deep.picture))
     with open_source(tmp_path) as source:
-        assert next(iter(source)).plate is None, "nobody asked for it"
+        assert next(iter(source)).deep is None, "nobody asked for it"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -156,7 +156,7 @@ def test_pictures_of_16_bits_keep_their_codes(tmp_path: pathlib.Path, suffix: st
     (tmp_path / f"a{suffix}").write_bytes(cv2.imencode(suffix, codes[..., ::-1])[1].tobytes())
     deep, frame = read_one(tmp_path / f"a{suffix}")
     assert deep == "codes"
-    np.testing.assert_array_equal(frame.plate.picture, codes)
+    np.testing.assert_array_equal(frame.deep.picture, codes)
 
 
 def test_a_measured_response_is_read_between_its_codes(tmp_path: pathlib.Path) -> None:
@@ -265,7 +265,7 @@ def test_what_no_deep_frame_is_gets_one_line(first: np.ndarray) -> None:
         with pytest.raises(UsageError, match=r"frame is int64 \(120, 160, 3\); expected"):
             pipeline(first.astype(np.int64))
         with pytest.raises(UsageError, match=r"frame is float32 \(2, 2, 3\); expected"):
-            pipeline(Plate(np.zeros((2, 2, 3), np.float32)))
+            pipeline(DeepFrame(np.zeros((2, 2, 3), np.float32)))
     with pytest.raises(UsageError, match="linear frames of several exposures"):
         warp_ar.Pipeline("desk", device="cpu", linear=True, exposures=(0.01, 0.001))
 
@@ -311,7 +311,7 @@ def test_video_of_10_bits_comes_back(
     assert (said["codec_name"], said["pix_fmt"], said["color_range"]) == ("hevc", "yuv420p10le", "tv")
     assert (said["color_transfer"], said["color_primaries"]) == (transfer, primaries)
     _, frame = read_one(path)
-    got = frame.plate.radiance("srgb")
+    got = frame.deep.radiance("srgb")
     # In the signal, whose steps the coding is uniform in: two of 10 bits in the mean, more where chroma is halved.
     wide = REC_709 if coding == "10bit" else REC_2020
     into = rgb_from_rgb(REC_709, wide).T
@@ -343,10 +343,10 @@ def test_folders_of_16_bits_and_openexr_come_back(tmp_path: pathlib.Path) -> Non
         sink.write(8.0 * picture - 0.25)
     _, frame = read_one(tmp_path / "png" / "0000.png")
     np.testing.assert_allclose(
-        encode_codes("srgb", frame.plate.radiance("srgb")), encode_codes("srgb", picture), atol=HALF_STEP16 + 1e-7
+        encode_codes("srgb", frame.deep.radiance("srgb")), encode_codes("srgb", picture), atol=HALF_STEP16 + 1e-7
     )
     _, frame = read_one(tmp_path / "exr" / "0000.exr")
-    np.testing.assert_allclose(frame.plate.picture, 8.0 * picture - 0.25, rtol=HALF, atol=1e-7)
+    np.testing.assert_allclose(frame.deep.picture, 8.0 * picture - 0.25, rtol=HALF, atol=1e-7)
 
 
 def test_wrong_codings_and_encoders_get_one_line(tmp_path: pathlib.Path) -> None:

@@ -28,7 +28,7 @@ from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Scene, SourceSpec,
 from warp_ar.scene.starter import amend_scene
 from warp_ar.sources.source import Frame
 from warp_ar.sources.sources import open_source
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.tracking.markers import find_dictionary
 
 pytestmark = pytest.mark.slow
@@ -430,7 +430,7 @@ def photographed(scale=1.0):
 
 def test_lives_line_names_a_print_that_is_not_true(monkeypatch):
     camera, frames = photographed(0.97)
-    scene = dataclasses.replace(load_scene("desk"), camera=camera, marker=SHEET, proxies=(), probes=(), lights=())
+    scene = dataclasses.replace(load_scene("desk"), camera=camera, marker=CARD_MARKER, proxies=(), probes=(), lights=())
     said, names = lives_words(scene, frames, monkeypatch)
     assert "card.print" in names
     assert len(said) == 1
@@ -450,12 +450,12 @@ def test_card_is_recognised_where_a_single_marker_is_expected(number, monkeypatc
     (found,) = [f for f in check_up(scene, "camera.mp4") if f.name not in {"camera.guessed"}]
     assert found.name == "marker.board"
     assert f"single marker of 80 mm, id {number}" in found.text
-    assert f'board = "{SHEET.board}"' in found.remedy
+    assert f'board = "{CARD_MARKER.board}"' in found.remedy
     assert 0.0 < found.error < 1.0
     said, names = lives_words(scene, frames, monkeypatch)
     assert names == ["marker.board"]
     assert [line.startswith(found.text) for line in said] == [True]
-    assert board_instead(SHEET, frames) is None
+    assert board_instead(CARD_MARKER, frames) is None
 
 
 def test_card_beside_a_single_marker_is_no_fault(card_frames):

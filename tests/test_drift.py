@@ -11,7 +11,7 @@ from tests.simulated_camera import decode_srgb
 from warp_ar import Pipeline
 from warp_ar.kernels.environment.accumulate import scale_radiance
 from warp_ar.scene import Pose, Scene, loads_scene
-from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.deep_frame import DeepFrame
 from warp_ar.tracking.drift import CONTRASTS, ExposureDrift
 from warp_ar.tracking.markers import printed_cells
 
@@ -92,7 +92,7 @@ def test_a_dark_desk_is_followed_by_its_linear_picture(gain):
     for picture in pictures:
         codes = encode(picture)
         by_codes.observe(codes, POSE)
-        by_light.observe(codes, POSE, Plate(picture.astype(np.float32)))
+        by_light.observe(codes, POSE, DeepFrame(picture.astype(np.float32)))
     off = [float(np.abs(drift.gain / gain - 1.0).max()) for drift in (by_light, by_codes)]
     assert off[0] < EXACT_GAIN
     assert off[1] > 4.0 * off[0]

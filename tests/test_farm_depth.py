@@ -77,10 +77,10 @@ def signal(radiance: np.ndarray, coding: str) -> np.ndarray:
     return {"pq": pq_of_light, "hlg": hlg_of_light}[coding](converted(radiance, REC_709, REC_2020))
 
 
-def plates(path: pathlib.Path) -> list[np.ndarray]:
+def deep_frames(path: pathlib.Path) -> list[np.ndarray]:
     with open_source(path) as source:
         source.keeps_depth = True
-        return [frame.plate.radiance("srgb") for frame in source]
+        return [frame.deep.radiance("srgb") for frame in source]
 
 
 def tags(path: pathlib.Path) -> tuple[str, ...]:
@@ -108,7 +108,7 @@ def test_segments_of_a_deep_recording_are_joined_as_deep_as_it_came(clip: tuple[
         for first in (3, 0):
             for number, picture in enumerate(lit(first, first + 3), first):
                 np.testing.assert_array_equal(picture, one[number], err_msg=f"frame {number}")
-    joined, alone, before = plates(parts / "a.mp4"), plates(whole / "a.mp4"), plates(folder / "a.mp4")
+    joined, alone, before = deep_frames(parts / "a.mp4"), deep_frames(whole / "a.mp4"), deep_frames(folder / "a.mp4")
     assert len(joined) == COUNT
     for a, b, picture in zip(joined, alone, one, strict=True):
         for got in (a, b):

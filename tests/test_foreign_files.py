@@ -176,9 +176,9 @@ def test_any_tiff_is_read(tmp_path_factory, kind, planes, channels):
     assert out.open(str(path), spec)
     assert out.write_image(values)
     out.close()
-    image, plate = read_frame(path)
+    image, deep = read_frame(path)
     wanted = np.repeat(values, 3, 2) if channels == 1 else values[..., :3]
-    np.testing.assert_array_equal(image if plate is None else plate.picture, wanted)
+    np.testing.assert_array_equal(image if deep is None else deep.picture, wanted)
 
 
 def test_hidden_files_are_no_frames(tmp_path):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
 from tests.recover_rig import solve_here
-from warp_ar.engine.frame_culling import Demand
+from warp_ar.engine.frame_culling import FrameCulling
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.light.estimate import Estimate
 from warp_ar.light.recovery import Recovery
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 
 class Step:
-    """What ``Demand`` asks of a stage."""
+    """What ``FrameCulling`` asks of a stage."""
 
     follows = False
 
@@ -56,12 +56,12 @@ DARK, EMPTY, NOTHING = Reach(light=False), Reach(objects=False), Reach(objects=F
 
 
 def test_an_idle_stage_clears_once_and_rests_with_what_only_it_reads() -> None:
-    demand = Demand(STEPS, ("image",))  # type: ignore[arg-type]
-    assert demand.look(EMPTY) == ({}, {"shade"}), "what it wrote before must go"
+    culling = FrameCulling(STEPS, ("image",))  # type: ignore[arg-type]
+    assert culling.look(EMPTY) == ({}, {"shade"}), "what it wrote before must go"
     nobody = "nothing reads its filtered in this frame"
-    assert demand.look(EMPTY) == ({"shade": "no objects", "filter": nobody}, set())
-    assert demand.look(Reach()) == ({}, set())
-    assert demand.look(EMPTY)[1] == {"shade"}, "it has written since"
+    assert culling.look(EMPTY) == ({"shade": "no objects", "filter": nobody}, set())
+    assert culling.look(Reach()) == ({}, set())
+    assert culling.look(EMPTY)[1] == {"shade"}, "it has written since"
 
 
 # --- Pictures ---------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from warp_ar import calibrate
 from warp_ar.calibration.response import measure_grey_response
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, load_scene
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 
 pytestmark = pytest.mark.slow
 
@@ -89,7 +89,7 @@ def test_the_command_writes_it_into_the_scene(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     scene.write_text(
         '# mine\nschema = 1\n[camera] # guessed\nfield_of_view = 60.0\n[marker]\ndictionary = "DICT_4X4_50"\n'
-        f'board = "{SHEET.board}"\n'
+        f'board = "{CARD_MARKER.board}"\n'
     )
     assert calibrate.main(["response", *map(str, sorted(tmp_path.glob("*.png"))), "--write", str(scene)]) == 0
     said = capsys.readouterr().out

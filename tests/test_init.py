@@ -30,7 +30,7 @@ def test_folder_is_a_scene(tmp_path, capsys):
     assert said.splitlines()[-1] == f"next: python -m warp_ar.live {tmp_path / 'my desk'}"
     assert "radius" not in said  # it is given
     scene = load_scene(tmp_path / "my desk")
-    assert (scene.name, scene.marker) == ("my desk", card_layout.SHEET)
+    assert (scene.name, scene.marker) == ("my desk", card_layout.CARD_MARKER)
     assert scene.probes[0].radius == 0.025
     assert scene.probes[0].center == card_layout.ball_center(0.025)
     assert scene.source.camera == 3
@@ -59,7 +59,7 @@ def test_guessed_camera_fits_any_frame():
 def test_pdf_prints_at_true_scale(paper, size, tmp_path):
     """Rendered back to pixels of a quarter millimetre: board, rulers and paper have their lengths."""
     path = tmp_path / "card.pdf"
-    write_card(card_layout.SHEET, path, paper)
+    write_card(card_layout.CARD_MARKER, path, paper)
     assert is_signed(path)
     with pypdfium2.PdfDocument(path) as document:
         page = document[0]
@@ -83,7 +83,7 @@ def test_pdf_prints_at_true_scale(paper, size, tmp_path):
 def test_everything_on_the_sheet_is_where_it_says(tmp_path):
     """Greys and the ball's cross, looked up by the board's own frame."""
     per_metre = 5000
-    page = card_layout.draw_sheet((0.21, 0.297), per_metre, draw_card(card_layout.SHEET, per_metre))
+    page = card_layout.draw_page((0.21, 0.297), per_metre, draw_card(card_layout.CARD_MARKER, per_metre))
     row, column = np.array(page.shape) / 2  # the sheet's width is even about the board
     marker = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)).detectMarkers(page)
     by_number = {int(n): c[0] for n, c in zip(np.ravel(marker[1]), marker[0], strict=True)}
@@ -104,7 +104,7 @@ def test_everything_on_the_sheet_is_where_it_says(tmp_path):
 @pytest.mark.parametrize(
     "marker",
     [
-        card_layout.SHEET,
+        card_layout.CARD_MARKER,
         Marker("DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022)),
         Marker("DICT_6X6_50", board=CharucoBoard(8, 11, 1.0, 0.7)),
         Marker("DICT_APRILTAG_36h11", board=CharucoBoard(6, 5, 1.0, 0.75)),

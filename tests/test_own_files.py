@@ -24,7 +24,7 @@ from warp_ar.output.sinks import open_sink
 from warp_ar.output.video_sink import VideoSink, WholeFragments
 from warp_ar.scene import Camera
 from warp_ar.signature import COMMENT, PROGRAM, is_signed, sign_png
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 
 
 def test_all_names_are_looked_at_before_the_folder_is_made(tmp_path: pathlib.Path, capsys) -> None:
@@ -202,7 +202,7 @@ def test_one_place_sets_files_aside_and_renames() -> None:
 # --- Files that this program writes are known as its own; others are not, whatever they hold --------------------------
 
 
-REPORT = CameraReport(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), 0.1, (0.1,), 0.1, 1.0, (), SHEET, (5.0, 40.0))
+REPORT = CameraReport(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), 0.1, (0.1,), 0.1, 1.0, (), CARD_MARKER, (5.0, 40.0))
 CURVE = np.repeat(np.linspace(0.0, 1.0, 256)[:, None] ** 2, 3, axis=1)
 
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ar.calibration.saturation import FULL, SaturationLevels, ball_codes
 from warp_ar.kernels.color import camera_table, decode_table, is_saturated, saturation_codes
-from warp_ar.sources.deep_frame import Plate, codes8
+from warp_ar.sources.deep_frame import DeepFrame, codes8
 
 DISC = (160.0, 120.0, 90.0)
 
@@ -37,20 +37,20 @@ def unrounded_ball(top, surface=60.0, noise=1.5, seed=0):
     return np.minimum(image, top)
 
 
-def plate_of_10_bits(image):
+def deep_of_10_bits(image):
     """Codes in steps of 8 bits as a sensor of 10 bits has them, widened to 16."""
     codes = np.clip(np.round(image / STEP10), 0, 1023)
-    return Plate(np.round(codes * (65535.0 / 1023.0)).astype(np.uint16))
+    return DeepFrame(np.round(codes * (65535.0 / 1023.0)).astype(np.uint16))
 
 
 @pytest.mark.parametrize("step", [950, 951, 953, 990])
 def test_a_plateau_between_two_codes_of_8_bits_is_told_by_deep_frames(step):
     """Steps of 10 bits that are 236.8, 237.05, 237.55 and 246.8 of 255: rounding to 8 bits misses three of them."""
-    plate = plate_of_10_bits(unrounded_ball(step * STEP10))
+    deep = deep_of_10_bits(unrounded_ball(step * STEP10))
     levels = SaturationLevels()
-    assert levels.observe(codes8(plate, "srgb"), [DISC], plate=plate)
+    assert levels.observe(codes8(deep, "srgb"), [DISC], deep=deep)
     np.testing.assert_allclose(levels.levels, step * STEP10, atol=0.51 / 257.0)  # rounding to 16 bits
-    below, _ = plate.clip_levels("srgb", levels.levels)
+    below, _ = deep.clip_levels("srgb", levels.levels)
     assert (below < decode_table("srgb")[round(step * STEP10)]).all()
 
 

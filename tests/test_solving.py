@@ -139,7 +139,7 @@ def test_two_estimates_take_turns(process):
         assert second.result(60.0)[0] is not solvers[1]
 
 
-def test_a_process_beside_delayed_frames_gives_the_same_light(monkeypatch):
+def test_a_background_process_with_delayed_frames_gives_the_same_light(monkeypatch):
     """As on CUDA, where frames are bound by the interpreter's lock: what takes effect, and when, are the same."""
     scene = load_scene("desk")
     with open_source(scene.source.path) as source:
@@ -148,23 +148,23 @@ def test_a_process_beside_delayed_frames_gives_the_same_light(monkeypatch):
     ask = SolvingProcess._ask
     monkeypatch.setattr(SolvingProcess, "_ask", lambda *given: solved.append(1) or ask(*given))
     take = recover.Recover._solve
-    for beside in (False, True):
+    for background in (False, True):
         with contextlib.closing(SolvingProcess()) as process:
             monkeypatch.setattr(solving, "PROCESS", process)
-            if beside:
+            if background:
                 process.prepare()
                 wait_until_ready(process)
             monkeypatch.setattr(
                 recover.Recover,
                 "_solve",
-                lambda self, solver, _, camera, beside=beside: take(self, solver, beside, camera),
+                lambda self, solver, _, camera, background=background: take(self, solver, background, camera),
             )
             with Pipeline(scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
                 light = [
                     pipeline(image, time_seconds=index / 24.0).environment.copy() for index, image in enumerate(images)
                 ]
         shown.append(light)
-        assert bool(solved) == beside
+        assert bool(solved) == background
     np.testing.assert_array_equal(shown[0], shown[1])
 
 

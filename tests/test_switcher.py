@@ -42,7 +42,7 @@ def go_over(switcher: PipelineSwitcher, wanted: Target) -> Pipeline | None:
     return switcher.take()
 
 
-def test_numbers_are_changed_in_place_and_all_else_is_built_beside() -> None:
+def test_numbers_are_changed_in_place_and_all_else_is_built_in_the_background() -> None:
     switcher = PipelineSwitcher(device="cpu")
     first = switcher.open(target())
     assert switcher.follow(target(lights=(Light("point", 5.0, at=(0.1, -0.1, 0.2)),))) is first

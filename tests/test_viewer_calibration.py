@@ -16,7 +16,7 @@ from tests.rendered_room import look_at
 from tests.viewer_rig import Running, page_scene, rendered_cards
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Pose, load_calibration
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.viewer.host import Lit
 from warp_ar.viewer.protocol import Picture
 from warp_ar.viewer.server import encode_jpeg
@@ -79,7 +79,7 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
     """The board is shown from a dozen sides; what comes out is the camera that took the pictures."""
     size = (480, 360)
     truth = Camera(*size, 430.0, 430.0, 243.0, 176.0, (-0.12, 0.03, 0.0, 0.0))
-    views = list(rendered_cards(truth, 14, seed=5, marker=SHEET))
+    views = list(rendered_cards(truth, 14, seed=5, marker=CARD_MARKER))
     with Running(page_scene()) as running:
         with pytest.raises(UsageError, match="no calibration is running"):
             running.edit(type="calibrate", step="finish")

@@ -15,7 +15,7 @@ from warp_ar.errors import SceneError, UsageError
 from warp_ar.scene import Exposure, Light, MirrorMaterial, PhongMaterial, bundled_scenes, load_scene
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.viewer import edits, protocol
 from warp_ar.viewer.controls import Controls, Feed
 from warp_ar.viewer.edits import Wanted
@@ -144,7 +144,7 @@ def test_the_printed_card_is_used_with_the_sizes_that_were_typed() -> None:
     assert edits.card_ruler(used) == pytest.approx(0.097)
     assert edits.card_ruler(edits.use_card(scene, 0.031, 0.1)) == pytest.approx(0.1)
     assert edits.card_ruler(scene) is None
-    assert used.marker.board.square_length == pytest.approx(0.97 * SHEET.board.square_length)
+    assert used.marker.board.square_length == pytest.approx(0.97 * CARD_MARKER.board.square_length)
     assert used.probes[0].center == pytest.approx((0.0, 0.97 * 0.114, 0.031))
     assert any(proxy.shape == "plane" for proxy in used.proxies)
     # Boxes stood around the marker of before; those that were pointed out beside the card stay.

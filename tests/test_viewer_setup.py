@@ -19,7 +19,7 @@ from tests.random_desk import RandomDesk
 from warp_ar.calibration.card import write_card
 from warp_ar.kernels.color import decode_table
 from warp_ar.srgb import decode_srgb
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
 pytestmark = [
@@ -50,7 +50,7 @@ def dimmed(image: np.ndarray, light: float) -> np.ndarray:
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> RandomDesk:
     card = tmp_path_factory.mktemp("card") / "card.pdf"
-    write_card(SHEET, card, "a4", 600)
+    write_card(CARD_MARKER, card, "a4", 600)
     return RandomDesk(card, SEED)
 
 

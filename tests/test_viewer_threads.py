@@ -1,4 +1,4 @@
-"""What the page's threads do at once: two viewers that edit, sources that change, work beside the frames that fails."""
+"""What the page's threads do at once: two viewers that edit, sources that change, background work that fails."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ async def test_who_goes_in_the_midst_of_a_file_is_no_fault_of_the_program(caplog
     assert not caplog.records
 
 
-# ---------------------------------------------------------------------------------------------- work beside the frames
+# ------------------------------------------------------------------------------------------------------ background work
 
 
 def test_a_check_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,7 +40,7 @@ from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, load
 from warp_ar.scene.description import INTRINSICS
 from warp_ar.scene.starter import amend_scene, guesses
 from warp_ar.sources.sources import open_source, source_of
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 
 Image = NDArray[np.uint8]
 
@@ -86,7 +86,7 @@ def make_parser() -> argparse.ArgumentParser:
             command.add_common("--overwrite")
         return command.add_argument
 
-    board = f'a board, as in a scene: "{SHEET.board}", "grid 4x3 0.04 0.01" (metres)'
+    board = f'a board, as in a scene: "{CARD_MARKER.board}", "grid 4x3 0.04 0.01" (metres)'
     option = add("card", "write the card, or a marker or board of your own, to print at true size", "card.pdf")
     option("--dictionary", metavar="NAME", help=f"OpenCV dictionary of a single marker (default: {Marker.dictionary})")
     option("--id", type=FROM_0, metavar="N", help="print this marker instead of the card (default: 0)")
@@ -267,7 +267,7 @@ def _run(options: argparse.Namespace) -> int:
         if replaced := check_replaceable(options.output, overwrite=options.overwrite):
             say(replaced)
     if options.command == "card":
-        write_card(_marker(options) or SHEET, options.output, options.paper, options.dpi)
+        write_card(_marker(options) or CARD_MARKER, options.output, options.paper, options.dpi)
         print(
             f"{options.output}: print at 100 %, not fitted to the page, and check with a ruler that 100 mm are 100 mm"
         )

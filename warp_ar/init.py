@@ -23,7 +23,7 @@ from warp_ar.errors import SinkError, UsageError, printable, reason
 from warp_ar.files import take_name
 from warp_ar.scene import bundled_scenes, load_scene
 from warp_ar.scene.starter import starter_scene
-from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
+from warp_ar.tracking.card_layout import CARD_MARKER, RINGS, ball_center
 
 SCENE, MESH = "scene.toml", "teapot.ply"
 CARDS = tuple(
@@ -71,7 +71,7 @@ def make_desk(folder: Path, source: str | int, radius: float) -> None:
         hint = "".join(f"; {radius:g} {unit} are {metres:g}" for unit, metres in meant)
         right = f"expected metres from 0.005 to {largest:g}, which stands on the card"
         raise UsageError(f"--radius {radius:g}: {right}{hint}")
-    text = starter_scene(folder.absolute().name, source, SHEET, ball_center(radius), radius, MESH)
+    text = starter_scene(folder.absolute().name, source, CARD_MARKER, ball_center(radius), radius, MESH)
     try:
         with tempfile.TemporaryDirectory(prefix=".warp_ar_init_", dir=folder.absolute().parent) as aside:
             made = Path(aside) / "desk"
@@ -79,7 +79,7 @@ def make_desk(folder: Path, source: str | int, radius: float) -> None:
             (made / SCENE).write_text(text, encoding="utf-8")
             shutil.copyfile(bundled_scenes()["desk"].parent / "meshes" / MESH, made / MESH)
             for name, paper, dpi in CARDS:
-                write_card(SHEET, made / name, paper, dpi)
+                write_card(CARD_MARKER, made / name, paper, dpi)
             load_scene(made)
             take_name(made, folder)
     except OSError as error:

@@ -39,7 +39,7 @@ from warp_ar.scene.exif import FULL_FRAME_DIAGONAL
 HARDLY_KNOWN = 1.2
 """Ratio of the largest to the least focal length that fits, above which the focal length counts as uncertain."""
 
-WAYS = ("--rectangle", "--point", "--vanishing-x, -y, -z", "--colmap")
+POSE_OPTIONS = ("--rectangle", "--point", "--vanishing-x, -y, -z", "--colmap")
 """Options that give the pose of a plate without the printed card."""
 AXES = ("x", "y", "z")
 
@@ -93,7 +93,7 @@ def _check(options: argparse.Namespace) -> bool:
     """Return True if the pose is to be found by the printed card; raise UsageError if options contradict each other."""
     lines = _lines(options)
     ways = options.rectangle, options.point, lines or None, options.colmap
-    given = [name for name, way in zip(WAYS, ways, strict=True) if way is not None]
+    given = [name for name, way in zip(POSE_OPTIONS, ways, strict=True) if way is not None]
     if len(given) > 1:
         raise UsageError(f"{' and '.join(given)} each give the pose; expected one of them")
     if (options.rectangle is None) != (options.rectangle_size is None):
@@ -134,7 +134,7 @@ def find_pose(plate: Photograph, options: argparse.Namespace) -> tuple[Camera, S
     else:
         card = card_points(plate.image) if options.point is None else np.split(np.array(options.point), [3], 1)
         if card is None:
-            right = f"expected it in the picture, or one of {'; '.join(WAYS)}"
+            right = f"expected it in the picture, or one of {'; '.join(POSE_OPTIONS)}"
             raise UsageError(f"{options.plate} does not show the printed card: {right}")
         points, pixels = card
         count = len(points)

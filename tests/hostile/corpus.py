@@ -159,7 +159,7 @@ def _deep_frames(path: pathlib.Path) -> int:
         return sum(frame.image.size for frame in source)
 
 
-def _plate(path: pathlib.Path) -> None:
+def _deep_picture(path: pathlib.Path) -> None:
     light = picture().astype(np.float32) / 64.0
     if path.suffix == ".exr":
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -268,9 +268,9 @@ READERS = (
         Reader(f"calibration, {kind.upper()}", f"camera.{kind}", load_calibration, _calibration)
         for kind in ("yml", "json", "xml")
     ),
-    Reader("frame of light, EXR", "a.exr", _deep_frames, _plate),
-    Reader("frame of 16 bits, PNG", "a.png", _deep_frames, _plate),
-    Reader("frame of 16 bits, TIFF", "a.tif", _deep_frames, _plate),
+    Reader("frame of light, EXR", "a.exr", _deep_frames, _deep_picture),
+    Reader("frame of 16 bits, PNG", "a.png", _deep_frames, _deep_picture),
+    Reader("frame of 16 bits, TIFF", "a.tif", _deep_frames, _deep_picture),
     Reader("video of 10 bits, MOV", "a.mov", _deep_frames, _deep_video),
     Reader("response", "response.txt", decode_table, _response),
     Reader("texture", "a.png", load_texture, _image),

@@ -29,7 +29,7 @@ from warp_ar.scene import Camera, Scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.pixel_rays import project
 from warp_ar.scene.pose import Pose
-from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.deep_frame import DeepFrame
 from warp_ar.tracking.drift import codes_around, still_points, under_boxes
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ class BallOcclusion:
         pose: Pose,
         seconds: float,
         gain: Array,
-        plate: Plate | None = None,
+        deep: DeepFrame | None = None,
     ) -> bool:
         """Test a frame.
 
@@ -122,17 +122,17 @@ class BallOcclusion:
             pose: ``camera_from_world``.
             seconds: Time of the frame.
             gain: Gain of the camera, RGB.
-            plate: The frame at full depth, used instead of ``image`` if given.
+            deep: The frame at full depth, used instead of ``image`` if given.
 
         Returns:
             True if a ball is covered.
         """
-        own = [self._cells(image, disc, gain, plate) for disc in discs]
+        own = [self._cells(image, disc, gain, deep) for disc in discs]
         known = self._shown is not None and len(own) == len(self._discs)
         changed = [known and _has_changed(now - before) for now, before in zip(own, self._discs, strict=False)]
         rests = known and not self._covered and not any(changed)
         if not rests or abs(seconds - self._looked) >= LOOK_SECONDS:
-            shown = self._logarithm(codes_around(image, self._camera, pose, self._points, plate), gain)
+            shown = self._logarithm(codes_around(image, self._camera, pose, self._points, deep), gain)
             covered = known and not rests and self._is_covered(shown, changed, discs, pose)
             if covered and not self._covered:
                 self._since = seconds
@@ -173,10 +173,10 @@ class BallOcclusion:
         return False
 
     def _cells(
-        self, image: NDArray[np.uint8], disc: tuple[float, float, float], gain: Array, plate: Plate | None = None
+        self, image: NDArray[np.uint8], disc: tuple[float, float, float], gain: Array, deep: DeepFrame | None = None
     ) -> Array:
         """Return the logarithm of a disc's cells, four samples of each, (cells, 3); NaN outside the picture."""
-        picture: NDArray[Any] = image if plate is None else plate.picture
+        picture: NDArray[Any] = image if deep is None else deep.picture
         x, y, radius = disc
         radius = max(radius, 1.0)
         if not (abs(x) < 1e5 and abs(y) < 1e5 and radius < 1e4):

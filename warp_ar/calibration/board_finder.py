@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.scene import CharucoBoard, Marker
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary
 
 Image = NDArray[np.uint8]
 
-KNOWN: Final = (SHEET, Marker(dictionary="DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022)))
+KNOWN: Final = (CARD_MARKER, Marker(dictionary="DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022)))
 """Boards distributed with this program, whose lengths are known."""
 DICTIONARIES: Final = (
     *("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL"),

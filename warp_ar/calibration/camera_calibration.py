@@ -24,7 +24,7 @@ from warp_ar.files import store
 from warp_ar.scene import Camera, CharucoBoard, Marker
 from warp_ar.scene.calibration_file import rational_of_fisheye
 from warp_ar.signature import PROGRAM
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.tracking.markers import make_board
 
 Image = NDArray[np.uint8]
@@ -99,7 +99,7 @@ class BoardViews:
             UsageError: if the marker is no ChArUco board.
         """
         if marker is not None and not isinstance(marker.board, CharucoBoard):
-            raise UsageError(f'--board: the camera is calibrated with a ChArUco board, such as "{SHEET.board}"')
+            raise UsageError(f'--board: the camera is calibrated with a ChArUco board, such as "{CARD_MARKER.board}"')
         self.marker: Marker | None = None
         """The board, or None until it is recognised."""
         self._layout, self._fisheye = board, fisheye

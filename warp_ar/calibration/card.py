@@ -16,7 +16,7 @@ from warp_ar.errors import UsageError
 from warp_ar.files import store
 from warp_ar.scene import CharucoBoard, Marker
 from warp_ar.signature import PROGRAM, sign_png
-from warp_ar.tracking.card_layout import SHEET, draw_sheet
+from warp_ar.tracking.card_layout import CARD_MARKER, draw_page
 from warp_ar.tracking.markers import find_dictionary, make_board
 
 Image = NDArray[np.uint8]
@@ -77,7 +77,7 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
     """Write a page that prints at true size, as PDF or PNG by the suffix.
 
     Args:
-        marker: Marker to print; ``SHEET`` gives the whole card, others get their name and a bar of 100 mm.
+        marker: Marker to print; ``CARD_MARKER`` gives the whole card, others get their name and a bar of 100 mm.
         path: The file.
         paper: A name of ``PAPERS``.
         dpi: Dots per inch.
@@ -94,9 +94,9 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
         raise UsageError(f"--output {path}: expected a name that ends in .pdf or .png")
     # PNG stores whole pixels per metre: with that resolution, the print is exact.
     per_metre = round(dpi / 0.0254)
-    if marker == SHEET:
+    if marker == CARD_MARKER:
         width, height = PAPERS[paper]
-        page = draw_sheet((width / 1e3, height / 1e3), per_metre, draw_card(marker, per_metre))
+        page = draw_page((width / 1e3, height / 1e3), per_metre, draw_card(marker, per_metre))
     else:
         page = _draw_page(marker, paper, per_metre)
     store(path, _pdf(page, per_metre) if path.suffix.lower() == ".pdf" else _png(page, per_metre))

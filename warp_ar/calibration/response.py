@@ -39,7 +39,7 @@ from warp_ar.errors import UsageError
 from warp_ar.files import store
 from warp_ar.signature import PROGRAM
 from warp_ar.srgb import decode_srgb
-from warp_ar.tracking.card_layout import GREY_SIZE, GREYS, SHEET, grey_centers
+from warp_ar.tracking.card_layout import CARD_MARKER, GREY_SIZE, GREYS, grey_centers
 from warp_ar.tracking.markers import make_board, printed_cells
 
 Array = NDArray[np.float64]
@@ -198,13 +198,13 @@ def measure_grey_response(images: Iterable[Image]) -> GreyResponse:
 def _sample(image: Image) -> _Samples | None:
     """Return patches and cells of one picture; None without a visible card, empty if its dots are resolved."""
     gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-    board = make_board(SHEET)
+    board = make_board(CARD_MARKER)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
     if ids is None or len(ids) < CORNERS:
         return None
     # OpenCV's board has its origin at a corner with y down the page; the card has it at the centre with y up.
-    assert SHEET.board is not None
-    width, height = SHEET.board.size
+    assert CARD_MARKER.board is not None
+    width, height = CARD_MARKER.board.size
     flat = np.asarray(board.getChessboardCorners(), float)[np.ravel(ids)][:, :2]
     flat = (flat - (width / 2, height / 2)) * (1.0, -1.0)
     matrix, _ = cv2.findHomography(flat, np.asarray(corners, float).reshape(-1, 2), cv2.RANSAC, 2.0)
@@ -228,7 +228,7 @@ def _sample(image: Image) -> _Samples | None:
 
 def _add_cells(image: Image, matrix: Array, places: list[Array], shares: list[float], codes: list[Array]) -> None:
     """Add the board's white and black cells, averaged over zones."""
-    cells, white, side, _ = printed_cells(SHEET)
+    cells, white, side, _ = printed_cells(CARD_MARKER)
     middle = np.column_stack([a.ravel() for a in np.meshgrid(*[np.linspace(-0.15, 0.15, 3) * side] * 2)])
     extent = np.abs(cells[:, :2]).max(0)
     zone = np.clip(((cells[:, :2] / extent + 1) / 2 * ZONES).astype(int), 0, ZONES - 1) @ (1, ZONES)

@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 
 from warp_ar.scene import Camera, Probe
 from warp_ar.scene.pose import Pose
-from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.deep_frame import DeepFrame
 
 FULL = 255
 """Default saturation code of all channels."""
@@ -117,7 +117,7 @@ class SaturationLevels:
         image: NDArray[np.uint8],
         balls: Sequence[tuple[float, float, float]],
         gain: float = 1.0,
-        plate: Plate | None = None,
+        deep: DeepFrame | None = None,
         *,
         bent: bool = False,
     ) -> bool:
@@ -127,16 +127,16 @@ class SaturationLevels:
             image: uint8 RGB (height, width, 3).
             balls: Centre x, y and radius of each ball, pixels.
             gain: Gain of the camera relative to its first frame, if it drifts.
-            plate: The frame at full depth, whose codes inside balls are used instead of those of ``image``; not for
-                linear plates.
+            deep: The frame at full depth, whose codes inside balls are used instead of those of ``image``; not for
+                linear frames.
             bent: True if the camera is known to apply a tone curve, and its gain is estimated.
         """
         if self._is_full.all() and gain == 1.0:
             return False
         before = self.levels.copy()
         exact = None
-        if plate is not None and plate.picture.dtype == np.uint16:
-            exact = ball_codes(plate.picture, balls) / 257.0
+        if deep is not None and deep.picture.dtype == np.uint16:
+            exact = ball_codes(deep.picture, balls) / 257.0
         codes = ball_codes(image, balls) if exact is None else np.rint(exact).astype(np.uint8)
         top = luma_top(codes)
         if self._stays is None:

@@ -19,7 +19,7 @@ from warp_ar.calibration.card import PAPERS
 from warp_ar.checks.finding import Finding
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
 from warp_ar.scene.pixel_rays import project
-from warp_ar.tracking.card_layout import SHEET, board_top
+from warp_ar.tracking.card_layout import CARD_MARKER, board_top
 
 Image = NDArray[np.uint8]
 
@@ -47,9 +47,9 @@ FEWEST: Final = 2
 
 def card_scale(marker: Marker) -> float | None:
     """Return the ratio of a marker's lengths to those of the printed card; None if it is not that card."""
-    board, made = marker.board, SHEET.board
+    board, made = marker.board, CARD_MARKER.board
     assert isinstance(made, CharucoBoard)
-    if not isinstance(board, CharucoBoard) or marker.dictionary != SHEET.dictionary:
+    if not isinstance(board, CharucoBoard) or marker.dictionary != CARD_MARKER.dictionary:
         return None
     if (board.columns, board.rows) != (made.columns, made.rows):
         return None
@@ -80,7 +80,7 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
     miss, factor, paper = best
     if miss > SAME or abs(factor - 1.0) < OFF:
         return []
-    made = SHEET.board
+    made = CARD_MARKER.board
     assert isinstance(made, CharucoBoard)
     right = factor * told
     lengths = f"{made.square_length * right:.5f} {made.marker_length * right:.5f}"

@@ -15,7 +15,7 @@ from collections.abc import Collection, Mapping, Sequence
 from warp_ar.stages.base import Reach, Stage
 
 
-class Demand:
+class FrameCulling:
     """Examines a plan's stages before every frame; remembers the stages whose arrays are clear."""
 
     def __init__(self, stages: Sequence[Stage], outputs: Collection[str]) -> None:

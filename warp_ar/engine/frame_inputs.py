@@ -30,7 +30,7 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import EMPTY, Outline, Rect, screen_rects
-from warp_ar.sources.deep_frame import Plate, decode_deep
+from warp_ar.sources.deep_frame import DeepFrame, decode_deep
 from warp_ar.stages.base import Arrays, Reach, Rows
 from warp_ar.tracking.drift import ExposureDrift
 from warp_ar.tracking.tracking import Places
@@ -63,7 +63,7 @@ class SeenFrame:
     timings: dict[str, StageTiming]
     places: Places = dataclasses.field(default_factory=dict)
     """Poses of the markers to which objects, lights or other parts of the scene are attached."""
-    plate: Plate | None = None
+    deep: DeepFrame | None = None
     """Frame at its full bit depth; None for 8-bit frames."""
 
 
@@ -193,7 +193,7 @@ class FrameInputs:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
         self._drift.saturation = self.saturation.levels
-        if not self._drift.observe(frame.image, pose, frame.plate):
+        if not self._drift.observe(frame.image, pose, frame.deep):
             return None, False
         self._have_lights_shine()
         is_bent = contrast != self._drift.contrast
@@ -291,7 +291,7 @@ class FrameInputs:
         self.block.upload()
         if self._take_picture(frame):
             touched.append("frame")
-        if self._take_plate(frame):
+        if self._take_deep(frame):
             touched.append("linear_frame")
         for name in dict.fromkeys(touched):
             self._arrays.touch(name)
@@ -311,7 +311,7 @@ class FrameInputs:
         if self._occlusion.rests(frame.seconds):
             return self._occlusion.is_covered
         discs = ball_discs(self._probes, self._camera, frame.pose)
-        return self._occlusion.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.plate)
+        return self._occlusion.observe(frame.image, discs, frame.pose, frame.seconds, self.gain, frame.deep)
 
     def _note_reflectance(self, frame: SeenFrame, pose: Pose) -> bool:
         """Update the estimate of the balls' reflectance; return True if the values in use changed."""
@@ -333,7 +333,7 @@ class FrameInputs:
             return
         discs = ball_discs(self._probes, self._camera, frame.pose)
         bent = self._drift is not None and self._drift.contrast > 0.0
-        if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.plate, bent=bent):
+        if self.saturation.observe(frame.image, discs, float(self.gain.mean()), frame.deep, bent=bent):
             self._write_decode()
 
     def _place_probes(self, frame: SeenFrame) -> Iterable[str]:
@@ -398,23 +398,23 @@ class FrameInputs:
         falls = bool(self.host_scene.light_outline().polygons)
         return Reach(objects=objects, shines=self._shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
-    def radiance(self, plate: Plate) -> npt.NDArray[np.float32]:
-        """Return a plate as linear radiance by the estimated tone curve, in a new array."""
+    def radiance(self, deep: DeepFrame) -> npt.NDArray[np.float32]:
+        """Return a deep frame as linear radiance by the estimated tone curve, in a new array."""
         contrast = 0.0 if self._drift is None else self._drift.contrast
-        if contrast == 0.0 or plate.picture.dtype != np.uint16:
-            return plate.radiance(str(self._camera.transfer))
+        if contrast == 0.0 or deep.picture.dtype != np.uint16:
+            return deep.radiance(str(self._camera.transfer))
         if self._bent != contrast:
             values, codes = camera_table(self._camera.transfer, contrast=contrast)[:256], np.arange(256) * 257.0
             table = np.stack([np.interp(np.arange(65536.0), codes, values[:, c]) for c in range(3)], -1)
             self._bent, self._bent_table = contrast, table.astype(np.float32)
-        return decode_deep(plate.picture, self._bent_table)
+        return decode_deep(deep.picture, self._bent_table)
 
-    def _take_plate(self, frame: SeenFrame) -> bool:
+    def _take_deep(self, frame: SeenFrame) -> bool:
         """Write the frame's linear radiance for the stages; return False if no stage reads it."""
-        if frame.plate is None or not self._linear_frame.size:
+        if frame.deep is None or not self._linear_frame.size:
             return False
-        self._linear_frame.assign(self.radiance(frame.plate))
-        self._linear_clip.assign(frame.plate.clip_levels(str(self._camera.transfer), self.saturation.levels))
+        self._linear_frame.assign(self.radiance(frame.deep))
+        self._linear_clip.assign(frame.deep.clip_levels(str(self._camera.transfer), self.saturation.levels))
         return True
 
     def receive(self) -> None:

@@ -39,7 +39,7 @@ from warp_ar.errors import UpdateError, UsageError, WarpArError
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.kinds import difference
-from warp_ar.sources.deep_frame import Plate, as_plate, check_plate, codes8
+from warp_ar.sources.deep_frame import DeepFrame, as_deep_frame, check_deep_frame, codes8
 from warp_ar.sources.exposures import BracketPlan, brightened, find_exposure, plan_bracket
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
@@ -463,7 +463,7 @@ class Pipeline(Closing):
                 ``__cuda_array_interface__`` (torch, JAX, CuPy), or a Warp array (height, width) of ``wp.vec3ub``. It
                 lies on the host or on the pipeline's device. On the device it is copied to the host only if the marker
                 must be found, and must not change until it has been rendered. A pipeline with ``linear`` also takes
-                uint16 codes, linear floats and a `Plate`.
+                uint16 codes, linear floats and a `DeepFrame`.
             time_seconds: Time at which the frame was taken; without times, frames come 30 times a second.
             pose: Known pose ``camera_from_world``, or the result of the caller's tracker; the marker is then not
                 searched for.
@@ -526,14 +526,14 @@ class Pipeline(Closing):
         pose = given.pose if isinstance(given, Track) else given
         if pose is not None and not isinstance(pose, Pose):
             raise UsageError(f"pose is {type(pose).__name__}; expected a Pose(R, t), camera_from_world, or a Track")
-        plate, image = self._take_depth(image)
+        deep, image = self._take_depth(image)
         picture = adopt_frame(image, self.size, self.device)
-        result = self._light_frame(picture, time_seconds, given, exposure_time, ahead=ahead, plate=plate)
+        result = self._light_frame(picture, time_seconds, given, exposure_time, ahead=ahead, deep=deep)
         if picture is not image and isinstance(picture, wp.array):
             self._borrowed.keep(picture)
         return result
 
-    def _take_depth(self, image: Any) -> tuple[Plate | None, Any]:
+    def _take_depth(self, image: Any) -> tuple[DeepFrame | None, Any]:
         """Return the frame at full depth, None if it has 8 bits, and its 8-bit codes."""
         if not self.plan.request.linear:
             if isinstance(image, np.ndarray) and image.dtype != np.uint8 and image.dtype.kind in "uf":
@@ -543,10 +543,10 @@ class Pipeline(Closing):
             return None, image
         transfer = str(self.camera.transfer)
         if isinstance(image, np.ndarray) and image.dtype == np.uint8:
-            return Plate(image.astype(np.uint16) * np.uint16(257)), image
-        plate = image if isinstance(image, Plate) else as_plate(np.asarray(image), self.size)
-        check_plate(plate.picture, self.size)
-        return plate, codes8(plate, transfer) if plate.codes is None else plate.codes
+            return DeepFrame(image.astype(np.uint16) * np.uint16(257)), image
+        deep = image if isinstance(image, DeepFrame) else as_deep_frame(np.asarray(image), self.size)
+        check_deep_frame(deep.picture, self.size)
+        return deep, codes8(deep, transfer) if deep.codes is None else deep.codes
 
     def _light_frame(
         self,
@@ -556,7 +556,7 @@ class Pipeline(Closing):
         exposure_time: float | None,
         *,
         ahead: bool,
-        plate: Plate | None = None,
+        deep: DeepFrame | None = None,
     ) -> Result:
         """Render a frame with checked arguments."""
         host_image = image if isinstance(image, np.ndarray) else None
@@ -572,7 +572,7 @@ class Pipeline(Closing):
             self._finish()
         if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
-        frame, state = self._look(image if host_image is None else host_image, now, pose, plate)
+        frame, state = self._look(image if host_image is None else host_image, now, pose, deep)
         if handed_over:
             return Result(frame.pose, state, self._hand_over(frame))
         rendered = self._render(self._send(frame))
@@ -655,7 +655,7 @@ class Pipeline(Closing):
         return places
 
     def _look(
-        self, image: Any, now: float, given: Pose | Track | None, plate: Plate | None
+        self, image: Any, now: float, given: Pose | Track | None, deep: DeepFrame | None
     ) -> tuple[SeenFrame, TrackState | None]:
         """Find the marker and advance the clock."""
         timings: dict[str, StageTiming] = {}
@@ -665,7 +665,7 @@ class Pipeline(Closing):
         seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
         self._index += 1
-        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places, plate), state
+        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places, deep), state
 
     def _render(self, frame: SeenFrame) -> Rendered:
         """Run the stages on a frame."""
@@ -686,9 +686,9 @@ class Pipeline(Closing):
         # Without a marker the objects' places are unknown: the frame passes unlit, and the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
         layers = self._layers_of(frame.image if frame.lost else None)
-        if layers is not None and frame.plate is not None:
-            clip = frame.plate.clip_levels(str(self.camera.transfer), self.inputs.saturation.levels)[0]
-            layers = layers.with_plate(self.inputs.radiance(frame.plate), clip)
+        if layers is not None and frame.deep is not None:
+            clip = frame.deep.clip_levels(str(self.camera.transfer), self.inputs.saturation.levels)[0]
+            layers = layers.with_plate(self.inputs.radiance(frame.deep), clip)
         milliseconds = (time.perf_counter() - start) * 1e3
         light = self._light
         emitters = self._arrays.get("emitters") if light.environment is not None else None

@@ -2,9 +2,9 @@
 
 On CUDA the stages that must run are captured once as a graph and replayed; each set of stages has its own graph. In the
 graph a stage waits only for the stages whose output it reads and for those that it runs after. So short kernels, which
-leave most of the device idle, run concurrently with others. On CPU, native threads (see ``crew``) take rows of any
-stage whose inputs are ready, in the order of the plan. So no thread waits for a pass that cannot be split, or for the
-last rows of one that can.
+leave most of the device idle, run concurrently with others. On CPU, native threads (see ``cpu_threads``) take rows of
+any stage whose inputs are ready, in the order of the plan. So no thread waits for a pass that cannot be split, or for
+the last rows of one that can.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any
 import warp as wp
 
 from warp_ar.device import capturing, exclusive, translating, usable_cores
-from warp_ar.engine.crew import Crew
+from warp_ar.engine.cpu_threads import CpuThreads
 from warp_ar.engine.environment_history import LIGHT_ARRAYS
-from warp_ar.engine.frame_culling import Demand
+from warp_ar.engine.frame_culling import FrameCulling
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel
@@ -78,7 +78,7 @@ class Scheduler:
         self._threads = min(cores, bands or cores)
         if bands is not None and bands > 1:
             self._threads = max(self._threads, 2)  # so that bands run concurrently on one core, too
-        self._crew: Crew | None = None
+        self._cpu_threads: CpuThreads | None = None
         self._prepared = False
         self._stages: list[Step] = []
         self._first_launches: list[Note] = []
@@ -94,7 +94,7 @@ class Scheduler:
         """Clock, in seconds, that times stages on the host."""
         self._build(spare or {})
         self._culling = culling
-        self._demand = Demand([stage for stage, _ in self._stages], plan.request.resources)
+        self._frame_culling = FrameCulling([stage for stage, _ in self._stages], plan.request.resources)
 
     def _build(self, spare: Mapping[str, Any]) -> None:
         """Allocate the arrays of the plan's stages and build their passes."""
@@ -121,9 +121,9 @@ class Scheduler:
 
     def close(self) -> None:
         """Stop the worker threads."""
-        if self._crew is not None:
-            self._crew.close()
-            self._crew = None
+        if self._cpu_threads is not None:
+            self._cpu_threads.close()
+            self._cpu_threads = None
         for stage, _ in self._stages:
             stage.close()
 
@@ -217,7 +217,9 @@ class Scheduler:
             self._first_launches.clear()
             if own:
                 readers = _find_readers([stage for stage, _ in self._stages])
-                self._crew = Crew(self._stages, notes, readers, threads=self._threads, bands_per_pass=self.bands)
+                self._cpu_threads = CpuThreads(
+                    self._stages, notes, readers, threads=self._threads, bands_per_pass=self.bands
+                )
         self._prepared = True
 
     def warm_up(self, progress: Progress | None = None) -> None:
@@ -230,7 +232,7 @@ class Scheduler:
             progress: As for ``prepare``.
         """
         self.prepare(progress)
-        self._demand.forget()
+        self._frame_culling.forget()
         if self._on_cpu:
             return
         with exclusive(self.device):
@@ -262,7 +264,7 @@ class Scheduler:
                 times: Mapping[str, float] = {}
             elif not self._on_cpu:
                 times = self._run_captured(due)
-            elif self._crew is None or sys.gettrace() is not None:
+            elif self._cpu_threads is None or sys.gettrace() is not None:
                 times = self._run_eager(due)  # under a debugger, so that it stops at breakpoints in launchers
             else:
                 times = self._run_side_by_side(due)
@@ -274,7 +276,7 @@ class Scheduler:
     def _choose(self) -> tuple[list[Step], dict[str, StageTiming]]:
         """Return the stages that run in this frame, with their passes, and the timings of the stages that do not."""
         reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
-        unneeded, clearing = self._demand.look(reach)
+        unneeded, clearing = self._frame_culling.look(reach)
         for name in clearing:
             self._seen.pop(name, None)
         due: list[Step] = []
@@ -307,9 +309,9 @@ class Scheduler:
 
     def _run_side_by_side(self, due: list[Step]) -> dict[str, float]:
         """Run stages on native threads by bands of rows; return milliseconds by stage."""
-        assert self._crew is not None
+        assert self._cpu_threads is not None
         start = self.clock()
-        times = self._crew.run(due)
+        times = self._cpu_threads.run(due)
         whole = (self.clock() - start) * 1e3
         busy = sum(times.values()) or 1.0
         return {stage.name: whole * times[stage.name] / busy for stage, _ in due}

@@ -88,14 +88,14 @@ class VideoPart(VideoFile):
             except (av.FFmpegError, OSError) as error:
                 raise SourceError(f"{self._path}: frame {self._first} cannot be reached: {reason(error)}") from error
             number = self._first
-            for image, stamp, plate in self._pictures(container, start):
+            for image, stamp, deep in self._pictures(container, start):
                 expected = float(ticks[number] * tick)
                 if stamp is None or abs(stamp - expected) > 0.5 * tick:
                     raise SourceError(
                         f"{self._path}: frame {number} is stamped {stamp} s, not {expected:g} s as its packet; "
                         "leave segment_frames out, so that it is lit as one"
                     )
-                yield Frame(number, self._time_of(number), image, plate=plate)
+                yield Frame(number, self._time_of(number), image, deep=deep)
                 number += 1
                 if number == self._end:
                     return

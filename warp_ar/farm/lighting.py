@@ -21,7 +21,7 @@ from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
 from warp_ar.farm.survey import Survey, keep_depth, lit_scene
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import skeleton
-from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.deep_frame import DeepFrame
 from warp_ar.sources.source import Frame, RecordedSource
 from warp_ar.tracking.tracking import given_pose
 
@@ -52,9 +52,9 @@ class Lit:
         """Picture as linear radiance, float32 RGB (height, width, 3), if ``light`` was called with that output."""
         if self.result is not None:
             return self.result.radiance
-        plate = self.frame.plate
+        deep = self.frame.deep
         wide = self.frame.image.astype(np.uint16) * np.uint16(257)
-        return self.pipeline.inputs.radiance(Plate(wide) if plate is None else plate)
+        return self.pipeline.inputs.radiance(DeepFrame(wide) if deep is None else deep)
 
 
 class Lighter(Closing):

@@ -27,7 +27,7 @@ from warp_ar.scene import (
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.pixel_rays import project, undistorted
 from warp_ar.scene.pose_file import load_pose_file
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.tracking.markers import MarkerDetector, pattern_of
 
 Array = NDArray[np.float64]
@@ -70,8 +70,8 @@ def card_points(image: Image) -> tuple[Array, Array] | None:
     The origin is the middle of the card's board: x right, y up the page, z out of it. Return None if fewer than
     ``FEWEST_MARKERS`` of its markers are visible.
     """
-    known = pattern_of(SHEET).markers
-    seen = MarkerDetector(SHEET.dictionary).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    known = pattern_of(CARD_MARKER).markers
+    seen = MarkerDetector(CARD_MARKER.dictionary).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
     found = {one.id: one.corners for one in seen if one.id in known}
     if len(found) < FEWEST_MARKERS:
         return None

@@ -23,7 +23,7 @@ from warp_ar.ball.ball_reflectance import Reflected, are_seen, measure_reflectan
 from warp_ar.photographs.support import Support
 from warp_ar.scene import Camera, Probe, Proxy, Scene
 from warp_ar.scene.pixel_rays import project
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.tracking.markers import printed_cells
 
 Array = NDArray[np.float64]
@@ -110,10 +110,10 @@ def exposure_by_paper(
     Returns:
         Ratio of the exposures; None if the paper clips or is not visible.
     """
-    cells, white, *_ = printed_cells(SHEET)
+    cells, white, *_ = printed_cells(CARD_MARKER)
     at = project(camera, support.pose.apply(cells[white])).astype(np.float32)
     codes = np.median(cv2.remap(image, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0], 0)
     if codes.max() >= CLIPPED or codes.min() < 1.0:
         return None
     seen = np.mean([np.interp(code, np.arange(256), table[:, channel]) for channel, code in enumerate(codes)])
-    return float(np.pi * seen / (SHEET.white * irradiance.mean()))
+    return float(np.pi * seen / (CARD_MARKER.white * irradiance.mean()))

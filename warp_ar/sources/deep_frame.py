@@ -1,7 +1,7 @@
 """Frames with more than 8 bits (16-bit camera codes or linear radiance), and their 8-bit versions.
 
     8-bit codes    marker detection, and averages over a pixel's neighbourhood
-    plate          measurement of radiance: mirror ball, surfaces, and the picture itself
+    deep frame     measurement of radiance: mirror ball, surfaces, and the picture itself
 
 16-bit codes are decoded by the camera's transfer. Linear radiance is used as it is, with Rec. 709 primaries; 1 is the
 value at which an 8-bit camera would clip, and values may exceed it.
@@ -31,7 +31,7 @@ _STEPS = 65536
 
 
 @dataclasses.dataclass(frozen=True)
-class Plate:
+class DeepFrame:
     """Frame at full bit depth."""
 
     picture: npt.NDArray[Any]
@@ -109,8 +109,8 @@ def finite_light(picture: npt.NDArray[Any]) -> Radiance:
     return np.ascontiguousarray(np.nan_to_num(picture, nan=0.0, posinf=65504.0, neginf=0.0), np.float32)
 
 
-def as_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> Plate:
-    """Return a copy of a caller's array as a plate.
+def as_deep_frame(image: npt.NDArray[Any], size: tuple[int, int]) -> DeepFrame:
+    """Return a copy of a caller's array as a deep frame.
 
     Args:
         image: RGB (height, width, 3): uint16 codes, or linear float32, float16 or float64.
@@ -119,12 +119,12 @@ def as_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> Plate:
     Raises:
         UsageError: The array has another size or type.
     """
-    check_plate(image, size)
-    return Plate(image.copy() if image.dtype == np.uint16 else finite_light(image))
+    check_deep_frame(image, size)
+    return DeepFrame(image.copy() if image.dtype == np.uint16 else finite_light(image))
 
 
-def check_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> None:
-    """Check the array of a plate's picture; arguments are those of `as_plate`.
+def check_deep_frame(image: npt.NDArray[Any], size: tuple[int, int]) -> None:
+    """Check the array of a deep frame; arguments are those of `as_deep_frame`.
 
     Raises:
         UsageError: The array has another size or type.
@@ -136,16 +136,16 @@ def check_plate(image: npt.NDArray[Any], size: tuple[int, int]) -> None:
         )
 
 
-def codes8(plate: Plate, transfer: str) -> npt.NDArray[np.uint8]:
-    """Return the 8-bit frame of a plate: 16-bit codes rounded, or linear radiance encoded.
+def codes8(deep: DeepFrame, transfer: str) -> npt.NDArray[np.uint8]:
+    """Return the 8-bit version of a deep frame: 16-bit codes rounded, or linear radiance encoded.
 
     Raises:
-        UsageError: The plate is linear, and the camera's transfer is not sRGB.
+        UsageError: The frame is linear, and the camera's transfer is not sRGB.
     """
-    if plate.picture.dtype == np.uint16:
-        return np.asarray(((plate.picture.astype(np.uint32) + 128) // 257).astype(np.uint8))
+    if deep.picture.dtype == np.uint16:
+        return np.asarray(((deep.picture.astype(np.uint32) + 128) // 257).astype(np.uint8))
     check_linear(transfer)
-    return srgb8(plate.picture)
+    return srgb8(deep.picture)
 
 
 def check_linear(transfer: str) -> None:

@@ -3,7 +3,7 @@
 Every picture is converted to 8-bit RGB. Grey is repeated in three channels. Alpha is dropped without blending, because
 a camera's colour does not depend on it. 16-bit values v become round(v / 257), so that 65535 becomes 255. Linear
 radiance (OpenEXR, TIFF of floats) is encoded as sRGB with values above 1 clipped; primaries that an OpenEXR states are
-converted to Rec. 709. The frame's plate keeps the original depth. The image's orientation tag is applied. A folder with
+converted to Rec. 709. The deep frame keeps the original depth. The image's orientation tag is applied. A folder with
 alternating exposures lists them in its sidecar, ``exposures.json``.
 """
 
@@ -24,7 +24,7 @@ from warp_ar.exr_file import read_linear_picture
 from warp_ar.files import parse_json, read_text
 from warp_ar.pictures import foreign_words, read_picture
 from warp_ar.scene.pose_file import natural_key
-from warp_ar.sources.deep_frame import Plate, finite_light, srgb8
+from warp_ar.sources.deep_frame import DeepFrame, finite_light, srgb8
 from warp_ar.sources.source import (
     DEFAULT_FPS,
     Frame,
@@ -89,9 +89,9 @@ class FrameFolder(RecordedSource):
             self._cycle = self._cycle or told
         shown = [self._exposures[path.name] for path in self._paths if path.name in self._exposures]
         self.exposures = distinct(self._cycle or shown)
-        first, plate = read_frame(self._paths[0])
+        first, deep = read_frame(self._paths[0])
         height, width, _ = first.shape
-        self.deep = "" if plate is None else "codes" if plate.picture.dtype == np.uint16 else "light"
+        self.deep = "" if deep is None else "codes" if deep.picture.dtype == np.uint16 else "light"
         self.size, self.fps, self.length = (width, height), fps, len(self._paths)
         self.description = f"{path} ({self.length} images, {width}x{height})"
 
@@ -102,9 +102,9 @@ class FrameFolder(RecordedSource):
 
     def _decode(self) -> Generator[Frame, None, None]:
         for index, path in enumerate(self._paths):
-            image, plate = read_frame(path)
+            image, deep = read_frame(path)
             check_size(image, self.size, str(path), index)
-            kept = plate if self.keeps_depth else None
+            kept = deep if self.keeps_depth else None
             yield Frame(index, index / self.fps, image, self._exposures.get(path.name), kept, path.as_posix())
 
 
@@ -113,11 +113,11 @@ def read_image(path: pathlib.Path) -> Image:
     return read_frame(path)[0]
 
 
-def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
+def read_frame(path: pathlib.Path) -> tuple[Image, DeepFrame | None]:
     """Return an image file as 8-bit RGB, and its full depth.
 
     Returns:
-        8-bit RGB, (height, width, 3), and the plate if the file has more than 8 bits, else None.
+        8-bit RGB, (height, width, 3), and the deep frame if the file has more than 8 bits, else None.
 
     Raises:
         SourceError: The file cannot be read, is no picture, is too large, or holds values of an unsupported type.
@@ -131,12 +131,12 @@ def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
             return rgb8(picture, label), None
         if picture.dtype == np.uint16:
             image = rgb8(picture, label)
-            return image, Plate(_three_channels(picture), codes=image)
+            return image, DeepFrame(_three_channels(picture), codes=image)
         if picture.dtype not in (np.float32, np.float64):
             raise SourceError(f"{label} holds {picture.dtype} values; 8 or 16 bits, or floats, are needed")
         light = finite_light(_three_channels(picture))
     image = srgb8(light)
-    return image, Plate(light, codes=image)
+    return image, DeepFrame(light, codes=image)
 
 
 def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:

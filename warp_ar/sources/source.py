@@ -27,7 +27,7 @@ import numpy.typing as npt
 from warp_ar.closing import Closing
 from warp_ar.errors import SourceError, UsageError, reason
 from warp_ar.files import kind_of
-from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.deep_frame import DeepFrame
 
 Image = npt.NDArray[np.uint8]
 
@@ -54,7 +54,7 @@ class Frame:
     exposure_time: float | None = None
     """Exposure time in seconds; None if the source does not state it."""
 
-    plate: Plate | None = None
+    deep: DeepFrame | None = None
     """Picture at full depth, if it has more than 8 bits and ``keeps_depth`` was set on the source."""
 
     name: str = ""
@@ -64,9 +64,9 @@ class Frame:
     """Index of the first frame of the current pass over a looped clip."""
 
     @property
-    def deepest(self) -> Plate | Image:
+    def deepest(self) -> DeepFrame | Image:
         """Return the picture at full depth if known, else the 8-bit frame; a pipeline of ``linear`` frames takes it."""
-        return self.image if self.plate is None else self.plate
+        return self.image if self.deep is None else self.deep
 
 
 class Source(Closing):
@@ -102,7 +102,7 @@ class Source(Closing):
     curve: str = ""
     """Transfer of HDR pictures, ``pq`` or ``hlg``; empty for other pictures."""
     keeps_depth: bool = False
-    """True if frames include their plates; must be set before reading."""
+    """True if frames include their deep frames; must be set before reading."""
 
     memory: Callable[[], Image] | None = None
     """Function that returns memory, uint8 (height, width, 3), for a frame, for example ``Pipeline.new_frame``. Sources

@@ -1,9 +1,9 @@
 """Video file as a source of frames, with rotation, pixel shape and edit list of its container applied.
 
-Pictures with more than 8 bits, and HDR pictures, have plates as well. A standard signal of 10 to 16 bits becomes 16-bit
-codes, decoded by the camera's transfer like 8-bit codes. A PQ or HLG signal becomes linear radiance with reference
-white at 1 and Rec. 709 primaries instead of BT.2020 or P3. FFmpeg only upsamples chroma. Matrix, range and transfer are
-computed here, because FFmpeg's own conversion to 16-bit RGB is off by 0.4 %.
+Pictures with more than 8 bits, and HDR pictures, are deep frames as well. A standard signal of 10 to 16 bits becomes
+16-bit codes, decoded by the camera's transfer like 8-bit codes. A PQ or HLG signal becomes linear radiance with
+reference white at 1 and Rec. 709 primaries instead of BT.2020 or P3. FFmpeg only upsamples chroma. Matrix, range and
+transfer are computed here, because FFmpeg's own conversion to 16-bit RGB is off by 0.4 %.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from warp_ar.errors import SourceError, reason
 from warp_ar.files import limits, too_much
 from warp_ar.signals import P3_D65, REC_709, REC_2020, converted, light_of_hlg, light_of_pq
-from warp_ar.sources.deep_frame import CLIP_MARGINS, Plate, codes8, srgb8
+from warp_ar.sources.deep_frame import CLIP_MARGINS, DeepFrame, codes8, srgb8
 from warp_ar.sources.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
 from warp_ar.srgb import decode_srgb
 
 Image = npt.NDArray[np.uint8]
-Taken: TypeAlias = tuple[Image, float | None, Plate | None]
-"""8-bit picture, its time stamp in seconds, and its plate if plates are kept."""
+Taken: TypeAlias = tuple[Image, float | None, DeepFrame | None]
+"""8-bit picture, its time stamp in seconds, and its deep frame if these are kept."""
 
 # Containers of video only: FFmpeg also renders text as pictures, and follows play lists to other files and hosts.
 _FORMATS = (
@@ -152,7 +152,7 @@ class VideoFile(RecordedSource):
     def _decode(self) -> Generator[Frame, None, None]:
         with self._open() as container:
             first, previous = None, -math.inf
-            for index, (image, stamp, plate) in enumerate(self._pictures(container)):
+            for index, (image, stamp, deep) in enumerate(self._pictures(container)):
                 check_size(image, self.size, str(self._path), index)
                 if self._retimed or stamp is None:
                     seconds = index / self.fps if self._retimed or index == 0 else previous + 1.0 / self.fps
@@ -161,10 +161,10 @@ class VideoFile(RecordedSource):
                     # Times increase strictly, even if a broken recorder wrote others.
                     seconds = stamp - first if stamp - first > previous else previous + 1.0 / self.fps
                 previous = seconds
-                yield Frame(index, seconds, image, plate=plate)
+                yield Frame(index, seconds, image, deep=deep)
 
     def _pictures(self, container: Any, first: int | None = None) -> Generator[Taken, None, None]:
-        """Yield every picture with its time stamp in seconds, and its plate if plates are kept.
+        """Yield every picture with its time stamp in seconds, and its deep frame if these are kept.
 
         All pictures before a damaged place are yielded before the error is raised.
 
@@ -215,13 +215,13 @@ class VideoFile(RecordedSource):
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
 
     def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
-        """Return 8-bit RGB of a picture, its time stamp in seconds, and its plate if plates are kept."""
+        """Return 8-bit RGB of a picture, its time stamp in seconds, and its deep frame if these are kept."""
         if self.deep != "light":
-            plate = plate_from_video(reformatter, picture, self._shape) if self.deep and self.keeps_depth else None
-            return rgb_from_video(reformatter, picture, self._memory_for, self._shape), picture.time, plate
-        plate = plate_from_video(reformatter, picture, self._shape)
-        image = codes8(plate, "srgb") if plate.codes is None else plate.codes
-        return image, picture.time, plate if self.keeps_depth else None
+            deep = deep_frame_from_video(reformatter, picture, self._shape) if self.deep and self.keeps_depth else None
+            return rgb_from_video(reformatter, picture, self._memory_for, self._shape), picture.time, deep
+        deep = deep_frame_from_video(reformatter, picture, self._shape)
+        image = codes8(deep, "srgb") if deep.codes is None else deep.codes
+        return image, picture.time, deep if self.keeps_depth else None
 
 
 def video_stream(container: Any, name: str) -> Any:
@@ -352,10 +352,10 @@ def presented(image: _Picture, picture: Any, shape: fractions.Fraction) -> _Pict
     return np.ascontiguousarray(turned[:: -1 if rows else 1, :: -1 if columns else 1])  # type: ignore[return-value]
 
 
-def plate_from_video(
+def deep_frame_from_video(
     reformatter: VideoReformatter, picture: Any, shape: fractions.Fraction = fractions.Fraction(1)
-) -> Plate:
-    """Return the plate of a decoded picture, by its own matrix, range, transfer and primaries.
+) -> DeepFrame:
+    """Return the deep frame of a decoded picture, by its own matrix, range, transfer and primaries.
 
     Args:
         reformatter: Reformatter of the current thread.
@@ -365,11 +365,11 @@ def plate_from_video(
     signal = presented(_signal(reformatter, picture), picture, shape)
     transfer, wide = picture.color_trc, _WIDE.get(picture.color_primaries)
     if transfer not in (ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67) and wide is None:
-        return Plate(_steps(signal).astype(np.uint16))
+        return DeepFrame(_steps(signal).astype(np.uint16))
     light = _light_table(int(transfer))[_steps(signal)]
     clip = float("inf") if transfer == ColorTrc.SMPTE2084 else float(_light_table(int(transfer))[_last_code()])
     light = converted(light, REC_709 if wide is None else wide, REC_709)
-    return Plate(light, clip, srgb8(light))
+    return DeepFrame(light, clip, srgb8(light))
 
 
 def _last_code() -> int:

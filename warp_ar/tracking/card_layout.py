@@ -17,7 +17,7 @@ from warp_ar.scene import CharucoBoard, Marker
 
 Image = NDArray[np.uint8]
 
-SHEET: Final = Marker(dictionary="DICT_4X4_50", board=CharucoBoard(5, 4, 0.032, 0.024))
+CARD_MARKER: Final = Marker(dictionary="DICT_4X4_50", board=CharucoBoard(5, 4, 0.032, 0.024))
 """Board of the sheet, with few and large cells that a camera of 640 x 480 resolves at arm's length."""
 BALL_PLACE: Final = (0.0, 0.114)
 """Point where the ball touches the sheet, metres: behind the board, so that the ball does not hide it from the
@@ -40,8 +40,8 @@ _DOT: Final = 0.00025
 
 def grey_centers() -> NDArray[np.float64]:
     """Return the centres of the grey patches in the board's frame, (n, 3) metres, in the order of ``GREYS``."""
-    assert isinstance(SHEET.board, CharucoBoard)
-    pitch, height = SHEET.board.square_length, SHEET.board.size[1]
+    assert isinstance(CARD_MARKER.board, CharucoBoard)
+    pitch, height = CARD_MARKER.board.square_length, CARD_MARKER.board.size[1]
     x = (np.arange(len(GREYS)) - (len(GREYS) - 1) / 2) * pitch
     return np.column_stack([x, np.full(len(GREYS), -(height / 2 + 0.004 + GREY_SIZE[1] / 2)), np.zeros(len(GREYS))])
 
@@ -56,7 +56,7 @@ def board_top(height: float) -> float:
     return _TOP + BALL_PLACE[1] + (height - _LETTER_HEIGHT) / 2
 
 
-def draw_sheet(size: tuple[float, float], pixels_per_metre: float, board: Image) -> Image:
+def draw_page(size: tuple[float, float], pixels_per_metre: float, board: Image) -> Image:
     """Draw the whole page.
 
     Args:
@@ -124,7 +124,8 @@ def _draw_rulers(page: Image, pixels_per_metre: float) -> None:
         page[at : at + thin, left : left + length] = 0
     lines = (
         "warp_ar: print at 100 %, not fitted to the page; both rulers are 100 mm. Lay it flat.",
-        f"Stand the mirror ball on the cross. Rings: its radius in mm. Board: {SHEET.dictionary}, {SHEET.board}",
+        "Stand the mirror ball on the cross. Rings: its radius in mm. "
+        f"Board: {CARD_MARKER.dictionary}, {CARD_MARKER.board}",
     )
     for k, text in enumerate(lines):
         _write(page, text, (left + round(7 * mm), bottom - round((12 - 4 * k) * mm)), pixels_per_metre, 0.0024)

@@ -36,7 +36,7 @@ from warp_ar.scene import Camera, Scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.pixel_rays import project
 from warp_ar.scene.pose import Pose
-from warp_ar.sources.deep_frame import Plate
+from warp_ar.sources.deep_frame import DeepFrame
 from warp_ar.tracking.markers import printed_cells
 
 Array = NDArray[np.float64]
@@ -118,18 +118,18 @@ class ExposureDrift:
         other._disagreements = list(self._disagreements)
         return other
 
-    def observe(self, image: NDArray[np.uint8], pose: Pose, plate: Plate | None = None) -> bool:
+    def observe(self, image: NDArray[np.uint8], pose: Pose, deep: DeepFrame | None = None) -> bool:
         """Update gain and contrast from a frame.
 
         Args:
             image: uint8 RGB (height, width, 3).
-            plate: The frame at full depth, used instead of ``image`` if given.
+            deep: The frame at full depth, used instead of ``image`` if given.
             pose: ``camera_from_world``.
 
         Returns:
             True if the gain or the contrast has changed.
         """
-        codes = codes_around(image, self._camera, pose, self._points, plate)
+        codes = codes_around(image, self._camera, pose, self._points, deep)
         before, contrast = self.gain, self.contrast
         if self._asks_contrast and not np.isfinite(self._first).any():
             self.contrast = self._print_contrast(codes)
@@ -222,7 +222,7 @@ class ExposureDrift:
 
 
 def codes_around(
-    image: NDArray[np.uint8], camera: Camera, pose: Pose, points: Array, plate: Plate | None = None
+    image: NDArray[np.uint8], camera: Camera, pose: Pose, points: Array, deep: DeepFrame | None = None
 ) -> Array:
     """Return mean codes around points, (n, 3); NaN for points that are not visible or clipped.
 
@@ -231,7 +231,7 @@ def codes_around(
         camera: Camera of the frame.
         pose: ``camera_from_world``.
         points: World points in metres, (n, 3).
-        plate: The frame at full depth, if given; its codes are scaled to 0..255 and not rounded.
+        deep: The frame at full depth, if given; its codes are scaled to 0..255 and not rounded.
     """
     result = np.full((len(points), 3), np.nan)
     pixels = project(camera, pose.apply(points))
@@ -239,11 +239,11 @@ def codes_around(
     inside = np.flatnonzero(((at >= 2) & (at < np.array([camera.width, camera.height]) - 2)).all(axis=1))
     around = at[inside] + _OFFSETS[:, None]
     rows, columns = around[..., 1], around[..., 0]
-    if plate is None:
+    if deep is None:
         codes = image.reshape(-1, 3).take(rows * image.shape[1] + columns, axis=0)
         sums = codes.sum(axis=0, dtype=np.int64)
     else:
-        codes = plate.codes_at(rows, columns, str(camera.transfer))
+        codes = deep.codes_at(rows, columns, str(camera.transfer))
         sums = codes.sum(axis=0)
     tells = np.flatnonzero(((codes.min(axis=0) > DARK) & (codes.max(axis=0) < BRIGHT)).all(axis=1))
     result[inside[tells]] = sums[tells] / len(_OFFSETS)

@@ -44,7 +44,7 @@ from warp_ar.scene.scene_files import files_of
 from warp_ar.scene.textures import file_stamp
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
-from warp_ar.tracking.card_layout import RINGS, SHEET, ball_center
+from warp_ar.tracking.card_layout import CARD_MARKER, RINGS, ball_center
 from warp_ar.viewer.protocol import EFFECTS, Command
 
 _T = TypeVar("_T")
@@ -182,7 +182,7 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
     if not _SCALES[0] <= scale <= _SCALES[1]:
         low, high = (1e3 * RULER * bound for bound in _SCALES)
         raise UsageError(f"the print's ruler measures {1e3 * ruler:g} mm; expected {low:g} to {high:g} mm")
-    made = SHEET.board
+    made = CARD_MARKER.board
     assert isinstance(made, CharucoBoard)
     lengths = (round(made.square_length * scale, 7), round(made.marker_length * scale, 7))
     board = CharucoBoard(made.columns, made.rows, *lengths)
@@ -196,7 +196,7 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
     return checked(
         dataclasses.replace(
             scene,
-            marker=dataclasses.replace(SHEET, board=board),
+            marker=dataclasses.replace(CARD_MARKER, board=board),
             probes=(ball,),
             proxies=kept if has_table else (*kept, Proxy("plane", size=(1.6, 1.2))),
         )

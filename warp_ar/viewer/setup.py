@@ -26,7 +26,7 @@ from warp_ar.errors import UsageError, WarpArError
 from warp_ar.light.card_light import light_by_card
 from warp_ar.output.environment_file import write_environment
 from warp_ar.scene import Camera, CapturedLight, Pose, Scene
-from warp_ar.tracking.card_layout import SHEET
+from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.tracking.tracking import TrackState
 from warp_ar.viewer.controls import Controls, Feed, Image
 from warp_ar.viewer.edits import Wanted
@@ -519,4 +519,4 @@ class CalibrationSession:
 
 def card_pdf(paper: str) -> bytes:
     """Return the printable card as a PDF, for paper ``a4`` or ``letter``."""
-    return written("card.pdf", lambda path: write_card(SHEET, path, paper))
+    return written("card.pdf", lambda path: write_card(CARD_MARKER, path, paper))

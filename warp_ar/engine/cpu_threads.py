@@ -87,7 +87,7 @@ class _System:
         return [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in self.functions]
 
 
-class Crew:
+class CpuThreads:
     """Threads of one scheduler, and the tables of its passes."""
 
     def __init__(
@@ -289,8 +289,8 @@ class Crew:
         self._state[0, self._open] = len(self._names)
         self._state[0, self._has_failed] = 0
         if len(self._threads) < len(self._helpers):
-            # A crew may be garbage collected without having been closed, so each thread holds all data that it reads
-            # until it returns. It does not hold the callback, which refers to the crew and is called only during
+            # The owner may be garbage collected without having been closed, so each thread holds all data that it reads
+            # until it returns. It does not hold the callback, which refers to the owner and is called only during
             # frames.
             read = (self._state, self._stages, self._passes, self._calls, self._readers, self._system)
             self._threads = [threading.Thread(target=_serve, args=(one, read), daemon=True) for one in self._helpers]
@@ -308,7 +308,7 @@ class Crew:
         return dict(zip(self._names, times.tolist(), strict=True))
 
     def close(self) -> None:
-        """End the threads, and release the references of the tables to the scheduler, which refers to this crew."""
+        """End the threads, and release the references of the tables to the scheduler, which refers to this object."""
         self._end()
         for thread in self._threads:
             thread.join()
