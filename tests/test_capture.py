@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.photo_files import write_photo
-from tests.photo_room import GAIN, environment, exposed, project, write_bracket
+from tests.photo_files import FOCAL_35MM, write_dng, write_photo
+from tests.photo_room import GAIN, environment, exposed, photograph, project, write_bracket
 from tests.test_photo_bracket import s_curve
 from warp_ar.ball.ball_finder import find_ball
 from warp_ar.capture import main
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
+from warp_ar.errors import UsageError
 from warp_ar.light.captured import Light, irradiance_above, latlong_directions, texel_solid_angles
 from warp_ar.live import main as live
 from warp_ar.photo_capture import capture_light
@@ -176,6 +177,31 @@ def test_a_response_that_was_found_is_written_into_the_scene(tmp_path, capsys):
     assert "the response is not srgb" in capsys.readouterr().err
     scene = load_scene(tmp_path / "photo.toml")
     assert scene.camera.transfer == tmp_path / "light.response.txt"
+
+
+def test_raw_photographs_need_no_response(tmp_path):
+    pytest.importorskip("rawpy", reason="needs the extra raw")
+    photos = [tmp_path / f"{chr(97 + k)}.dng" for k in range(len(BRACKET))]
+    for path, denominator in zip(photos, BRACKET, strict=True):
+        write_dng(path, GAIN / denominator * photograph()[0], denominator=denominator)
+
+    def under(outline, camera):
+        return plane_from_contact(outline.sphere, camera, project([0.0, 0.0, 0.0]))
+
+    known = {"device": "cpu", "focal_35mm": FOCAL_35MM, "reflectance": REFLECTANCE, "support": under}
+    found = capture_light(photos, shown=1, **known)
+    assert error(found.light, 60) < LIT
+    assert found.response is None
+    assert not any("response" in note for note in found.notes)
+    alone = capture_light(photos[-1:], circle=(*found.outline.center, found.outline.radius), **known)
+    # Its 16 bits show what its darkest codes of 8 would round away: they are below 2.
+    assert error(alone.light, BRACKET[-1]) < LIT
+    assert not any("assumed; with a phone's" in note for note in alone.notes)
+    lying = [1 / d**0.8 for d in BRACKET]
+    with pytest.raises(UsageError, match="exposures contradict the pictures"):
+        capture_light(photos, device="cpu", exposures=lying)
+    with pytest.raises(UsageError, match=r"--transfer gamma:2.2: expected none for .*a\.dng, which is linear"):
+        capture_light(photos, device="cpu", transfer="gamma:2.2")
 
 
 def test_an_outline_of_another_photograph_is_said(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 
 import av
 import numpy as np
@@ -94,6 +95,7 @@ def test_heic_that_is_called_jpeg_is_told_by_its_bytes(tmp_path):
     assert "IMG_1.jpg is HEIC" in error_of(tmp_path / "IMG_1.jpg")
 
 
-def test_raw_is_refused_with_what_to_do(tmp_path):
+def test_raw_is_refused_with_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
     (tmp_path / "IMG_1.CR3").write_bytes(b"\0\0\0\x18ftypcrx " + bytes(100))
-    assert "a raw photograph, which is not read: save it as JPEG" in error_of(tmp_path / "IMG_1.CR3")
+    assert "a raw photograph: pip install" in error_of(tmp_path / "IMG_1.CR3")

@@ -1,17 +1,19 @@
 """EXIF of photographs, and what their names say of exposures."""
 
 import math
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.photo_files import write_photo
+from tests.photo_files import write_dng, write_photo
 from warp_ar.errors import SceneError, SourceError
 from warp_ar.photographs.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
 from warp_ar.scene import loads_scene
 from warp_ar.scene.exif import PhotoInfo, read_exif
+from warp_ar.srgb import decode_srgb
 
 pytestmark = pytest.mark.slow
 
@@ -47,12 +49,29 @@ def test_no_photograph(tmp_path):
         read_photograph(tmp_path / "b.jpg")
 
 
-def test_raw_photographs_are_refused_though_they_hold_a_thumbnail(tmp_path):
+def test_raw_photographs_are_refused_though_they_hold_a_thumbnail(tmp_path, monkeypatch):
     """As most raw files are, this is a TIFF with a small picture in it."""
     cv2.imwrite(str(tmp_path / "thumbnail.tif"), np.full((120, 160, 3), 90, np.uint8))
     (tmp_path / "a.NEF").write_bytes((tmp_path / "thumbnail.tif").read_bytes())
-    with pytest.raises(SourceError, match=r"a\.NEF is a raw photograph, which is not read: save it as JPEG"):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    with pytest.raises(SourceError, match=r'a\.NEF is a raw photograph: pip install "warp-ar\[raw\]" reads it'):
         read_photograph(tmp_path / "a.NEF")
+
+
+def test_a_raw_photograph_is_linear_and_tells_its_exposure(tmp_path):
+    pytest.importorskip("rawpy", reason="needs the extra raw")
+    linear = np.linspace(0.02, 1.1, 640)[None, :, None] * np.ones((480, 1, 1)) * (0.9, 0.6, 0.3)
+    write_dng(tmp_path / "a.dng", linear, denominator=50, iso=200, f_number=2.0)
+    found = read_photograph(tmp_path / "a.dng")
+    assert found.is_raw
+    assert found.info.exposure == pytest.approx(1 / 50 * 2 / 4)
+    assert (found.info.width, found.info.height) == (640, 480)
+    # Rounding to 16 bits, of the sensor's values and of the codes.
+    seen = decode_srgb(found.deep[240, 8:-8] / 65535)
+    np.testing.assert_allclose(seen, np.minimum(linear[240, 8:-8], 1.0), atol=3e-4)
+    (tmp_path / "b.dng").write_bytes((tmp_path / "a.dng").read_bytes()[:400])
+    with pytest.raises(SourceError, match=r"b\.dng cannot be read as a raw photograph"):
+        read_photograph(tmp_path / "b.dng")
 
 
 def named(*names, infos=None):

@@ -7,7 +7,7 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -284,6 +284,11 @@ class _Bracket:
     curve: Array | None
     notes: tuple[str, ...]
 
+    @property
+    def deep(self) -> NDArray[np.uint16] | None:
+        """Return the only photograph in 16 bits; None if there are more, which are merged in 8 bits, or it has 8."""
+        return self.photos[0].deep if len(self.photos) == 1 else None
+
 
 def _merge_plan(
     photos: Sequence[Photograph],
@@ -294,6 +299,11 @@ def _merge_plan(
 ) -> _Bracket:
     """Return the photographs to merge, each with its ball's place and its exposure."""
     circle = (*outline.center, outline.radius)
+    raw = [photo.is_raw for photo in photos]
+    if any(raw) and transfer != "srgb":
+        raise UsageError(f"--transfer {transfer}: expected none for {photos[raw.index(True)].path}, which is linear")
+    if raw == [True]:
+        return _Bracket((reference,), (circle,), (1.0,), None, ())
     if len(photos) == 1:
         note = f"one photograph gives no response: {transfer} is assumed; with a phone's, darks may be 3 times darker"
         return _Bracket((reference,), (circle,), (1.0,), None, (note,))
@@ -316,7 +326,7 @@ def _merge_plan(
     picked = {name: None if claim is None else [claim[order[k]] for k in stay] for name, claim in claims.items()}
     agreed = agree_exposures(
         [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"],
-        [chosen[k].name for k in stay],
+        [chosen[k].name for k in stay], known=all(raw),
     )  # fmt: skip
     first = [chosen[k] for k in stay].index(reference)
     kept, more = thin_exposures(agreed.ratios, first, [chosen[k].name for k in stay])
@@ -393,6 +403,7 @@ def _unwrap(
             exposures=times if len(times) > 1 else (),
             shown=times[index] if len(times) > 1 else None,
             estimates="synchronous",
+            linear=bracket.deep is not None,
         )
     with pipeline:
         order = [*(k for k in range(len(times)) if k != index), index]
@@ -470,7 +481,7 @@ def _place(
     camera: Camera,
     sphere: Array,
     turn: Array,
-) -> tuple[Image, Pose]:
+) -> tuple[NDArray[Any], Pose]:
     """Return a photograph's window around its ball, and the pose that puts the ball there.
 
     A photograph's displacement against the shown one becomes a displacement of the ball before the camera, so that no
@@ -479,7 +490,7 @@ def _place(
     x0, y0, side = window
     x, y, radius = bracket.circles[k]
     dx, dy = round(x - own[0]), round(y - own[1])
-    image = bracket.photos[k].image
+    image = bracket.photos[k].image if bracket.deep is None else bracket.deep
     h, w = image.shape[:2]
     rows = np.clip(np.arange(y0 + dy, y0 + dy + side), 0, h - 1)
     columns = np.clip(np.arange(x0 + dx, x0 + dx + side), 0, w - 1)

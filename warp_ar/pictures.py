@@ -8,7 +8,7 @@ import os
 import re
 import struct
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
@@ -27,6 +27,8 @@ FORMATS = "PNG, JPEG, BMP, TIFF, WebP, GIF or PNM"
 
 RAW = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
 """Endings of raw photographs."""
+SRGB_CURVE = 2.4, 12.92
+"""Exponent of sRGB's curve, and the slope of its linear part."""
 HEIF = frozenset({".heic", ".heif", ".hif", ".avif"})
 """Endings of phone pictures that cannot be decoded here."""
 _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
@@ -59,9 +61,43 @@ def foreign_words(suffix: str, data: bytes = b"") -> str:
             "HEIC, which is not read: save it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; on a Mac: "
             "sips -s format jpeg *.HEIC --out jpegs; else: heif-convert or ImageMagick)"
         )
-    if suffix in RAW:
-        return "a raw photograph, which is not read: save it as JPEG, or as TIFF of 16 bits, in sRGB"
     return ""
+
+
+@contextlib.contextmanager
+def open_raw(path: str | os.PathLike[str], error: type[WarpArError]) -> Iterator[Any]:
+    """Open a raw photograph with rawpy, whose pixels are not yet decoded.
+
+    Raises:
+        WarpArError: As ``error``: rawpy is not installed, or the file is too large, damaged or no raw photograph.
+    """
+    try:
+        import rawpy
+    except ImportError as problem:
+        right = 'pip install "warp-ar[raw]" reads it; or save it as TIFF of 16 bits, in sRGB'
+        raise error(f"{path} is a raw photograph: {right}") from problem
+    data = read_bytes(path, "picture_bytes", error)
+    try:
+        with rawpy.RawPy() as raw:
+            raw.open_buffer(io.BytesIO(data))
+            check_size(raw.sizes.width, raw.sizes.height, error, str(path))
+            yield raw
+    except (rawpy.LibRawError, rawpy.NotSupportedError, ValueError, MemoryError) as problem:
+        raise error(f"{path} cannot be read as a raw photograph: {reason(problem)}") from problem
+
+
+def read_raw(path: str | os.PathLike[str], error: type[WarpArError]) -> npt.NDArray[np.uint16]:
+    """Return a raw photograph, upright, as 16-bit sRGB codes of its linear values, (height, width, 3).
+
+    The white balance is the camera's as shot. The largest code is the sensor's saturation, whatever the picture shows.
+
+    Raises:
+        WarpArError: As `open_raw`.
+    """
+    with open_raw(path, error) as raw:
+        raw.unpack()
+        plain = {"use_camera_wb": True, "no_auto_bright": True, "adjust_maximum_thr": 0.0}
+        return np.asarray(raw.postprocess(output_bps=16, gamma=SRGB_CURVE, **plain), np.uint16)
 
 
 def picture_size(data: bytes) -> Size | None:

@@ -414,6 +414,7 @@ def agree_exposures(
     names: Sequence[float] | None,
     given: Sequence[float] | None = None,
     labels: Sequence[str] = (),
+    known: bool = False,
 ) -> Exposures:
     """Determine the exposures of a bracket.
 
@@ -424,6 +425,7 @@ def agree_exposures(
         names: Exposure of each by its file name; None if unknown.
         given: Exposure of each given by the user, which takes precedence.
         labels: Names of the pictures.
+        known: True if ``transfer`` is certain, so that no response is estimated.
 
     Raises:
         UsageError: EXIF, names and pixels contradict each other; the message has all figures.
@@ -463,9 +465,9 @@ def agree_exposures(
         return Exposures(tuple(ratio / ratios[0] for ratio in ratios), None, tuple(notes))
     if off <= HOLDS:
         return Exposures(ratios, None, tuple(notes))
-    bent = estimate_response(seen, claim)
+    bent = seen if known else estimate_response(seen, claim)
     rest = _off(claim, bent.steps)
-    if rest > CONTRADICTS:
+    if known or rest > CONTRADICTS:
         raise UsageError(
             f"exposures contradict the pictures: from the longest to the shortest {figures} times, and no response "
             f"explains them (a step is off by {math.expm1(rest):.0%}); give the true ones with --exposures, or "

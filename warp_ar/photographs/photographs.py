@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import SceneError, SourceError
-from warp_ar.pictures import foreign_words
+from warp_ar.pictures import RAW, foreign_words
 from warp_ar.scene.exif import PhotoInfo, exposure_in_name, read_exif
-from warp_ar.sources.frame_folder import read_image
+from warp_ar.sources.frame_folder import read_frame
 
 Image = NDArray[np.uint8]
 
@@ -30,11 +30,18 @@ class Photograph:
     """uint8 RGB (height, width, 3), upright."""
     info: PhotoInfo
     """EXIF data."""
+    deep: NDArray[np.uint16] | None = None
+    """The picture in 16-bit codes; None if the file has 8 bits, or floats."""
 
     @property
     def name(self) -> str:
         """Return the file's name."""
         return self.path.name
+
+    @property
+    def is_raw(self) -> bool:
+        """Return True if the file is a raw photograph, whose response is known."""
+        return self.path.suffix.lower() in RAW
 
 
 def read_photograph(path: str | Path) -> Photograph:
@@ -49,16 +56,16 @@ def read_photograph(path: str | Path) -> Photograph:
     if not path.is_file():
         raise SourceError(f"there is no photograph {path}")
     if words := foreign_words(path.suffix.lower()):
-        # Many raw files are TIFFs as well, and would be read as their thumbnail.
         raise SourceError(f"{path} is {words}")
-    image = read_image(path)
+    image, frame = read_frame(path)
     try:
         info = read_exif(path)
     except SceneError:
         info = PhotoInfo(image.shape[1], image.shape[0])
     if (info.width, info.height) != (image.shape[1], image.shape[0]):
         info = dataclasses.replace(info, width=image.shape[1], height=image.shape[0])
-    return Photograph(path, image, info)
+    deep = frame.picture if frame is not None and frame.picture.dtype == np.uint16 else None
+    return Photograph(path, image, info, deep)
 
 
 def exposures_by_exif(photographs: Sequence[Photograph]) -> tuple[float, ...] | None:

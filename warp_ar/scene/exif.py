@@ -16,7 +16,7 @@ from PIL import ExifTags, Image
 
 from warp_ar.errors import SceneError
 from warp_ar.files import read_bytes
-from warp_ar.pictures import check_picture, picture_size
+from warp_ar.pictures import RAW, check_picture, open_raw, picture_size
 from warp_ar.scene.description import Camera
 
 FULL_FRAME_DIAGONAL: Final = math.hypot(36.0, 24.0)
@@ -31,7 +31,7 @@ number, and cameras differ in which diagonal they use."""
 LEAST_SIDE: Final = 400
 """Shorter side in pixels below which a picture is taken for a crop or a thumbnail."""
 _TURNED: Final = (5, 6, 7, 8)
-"""EXIF orientations that exchange width and height."""
+"""EXIF orientations that exchange width and height; LibRaw's are the first two of them."""
 
 # Exceptions that Pillow was observed to raise on damaged files; it documents none.
 _READING_ERRORS: Final = (
@@ -132,6 +132,11 @@ def read_exif(path: str | Path) -> PhotoInfo:
         SceneError: Damaged.
     """
     path = Path(path)
+    if path.suffix.lower() in RAW:
+        with open_raw(path, SceneError) as raw:
+            shot, sides = raw.other, (raw.sizes.iwidth, raw.sizes.iheight)
+            width, height = reversed(sides) if raw.sizes.flip in _TURNED else sides
+        return PhotoInfo(width, height, shot.shutter_speed or None, shot.iso_speed or None, shot.aperture or None)
     data = read_bytes(path, "picture_bytes", SceneError, f"{path}: the photograph")
     check_picture(data, SceneError, f"{path}: the photograph")
     try:

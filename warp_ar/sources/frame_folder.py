@@ -22,7 +22,7 @@ import numpy.typing as npt
 from warp_ar.errors import SourceError
 from warp_ar.exr_file import read_linear_picture
 from warp_ar.files import parse_json, read_text
-from warp_ar.pictures import foreign_words, read_picture
+from warp_ar.pictures import RAW, foreign_words, read_picture, read_raw
 from warp_ar.scene.pose_file import natural_key
 from warp_ar.sources.deep_frame import DeepFrame, finite_light, srgb8
 from warp_ar.sources.source import (
@@ -108,11 +108,6 @@ class FrameFolder(RecordedSource):
             yield Frame(index, index / self.fps, image, self._exposures.get(path.name), kept, path.as_posix())
 
 
-def read_image(path: pathlib.Path) -> Image:
-    """Return an image file as 8-bit RGB, converted as the module's docstring describes."""
-    return read_frame(path)[0]
-
-
 def read_frame(path: pathlib.Path) -> tuple[Image, DeepFrame | None]:
     """Return an image file as 8-bit RGB, and its full depth.
 
@@ -126,7 +121,10 @@ def read_frame(path: pathlib.Path) -> tuple[Image, DeepFrame | None]:
     if path.suffix.lower() == LINEAR_SUFFIX:
         light = read_linear_picture(path, SourceError, label).color
     else:
-        picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
+        if path.suffix.lower() in RAW:
+            picture = read_raw(path, SourceError)
+        else:
+            picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
         if picture.dtype == np.uint8:
             return rgb8(picture, label), None
         if picture.dtype == np.uint16:

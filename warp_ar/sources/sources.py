@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from warp_ar.declared import checked
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.pictures import foreign_words
+from warp_ar.pictures import RAW, foreign_words
 from warp_ar.scene import Scene
 from warp_ar.sources.capture_device import CaptureDevice
 from warp_ar.sources.frame_folder import IMAGE_SUFFIXES, FrameFolder
@@ -80,7 +80,7 @@ def open_source(
             raise UsageError("exposures: a stream from the network does not let its exposure be set")
         return NetworkStream(text, fps=fps)
     path = existing_path(pathlib.Path(spec))
-    if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
+    if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES | RAW:
         return FrameFolder(path, fps=fps or DEFAULT_FPS, loop=loop, exposures=exposures)
     if words := foreign_words(path.suffix.lower()):
         raise SourceError(f"{path} is {words}")
