@@ -249,6 +249,8 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
     notes = capture_light(photos, device="cpu", shown=1).notes
     assert any(note.startswith("photo_c.jpg is left out: it shows something else") for note in notes)
     assert any(note.startswith("photo_d.jpg lies 6.4 pixels apart") and "was moved" in note for note in notes)
+    odd = capture_light([photos[2], *photos[:2]], device="cpu", shown=0, circle=(272.0, 222.0, 48.5)).notes
+    assert "most photographs differ from photo_c.jpg: if it is the odd one, show another (--shown)" in odd
 
 
 def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(bracket, tmp_path, capsys, monkeypatch):

@@ -120,6 +120,13 @@ def test_a_response_of_no_camera_is_doubted_with_both_readings():
     assert "--exposures pixels is right (EXIF says 828, pixels say 6" in agreed.notes[1]
 
 
+def test_a_linear_response_of_8_bits_is_doubted():
+    """Times with half of the true steps: sRGB with them looks as a linear camera does."""
+    halved = [math.sqrt(t) for t in TRUE]
+    agreed = agree_exposures(patches(BRACKET), "srgb", halved, None)
+    assert any("no known camera has this response: gamma 1." in note for note in agreed.notes)
+
+
 def test_what_is_wrong_with_one_picture_spoils_no_other():
     """Between the anchor and the others stands one that shows something else."""
     images = [exposed(d).astype(np.uint8) for d in (30, 60, 120, 240)]

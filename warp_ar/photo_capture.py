@@ -320,6 +320,8 @@ def _merge_plan(
     rough = [_same_place(circle, reference.image, photo.image) for photo in chosen]
     aligned = align([photo.image for photo in chosen], rough, times, chosen.index(reference))
     notes = [f"{photo.name} is left out: {why}" for photo, why in zip(chosen, aligned.strangers, strict=True) if why]
+    if 2 * sum(map(bool, aligned.strangers)) >= len(photos):
+        notes.append(f"most photographs differ from {reference.name}: if it is the odd one, show another (--shown)")
     notes += [f"{photo.name} has no exposure in EXIF, so EXIF is not used" for photo in untold]
     notes += _shift_notes(chosen, aligned, rough, outline.radius)
     stay = [k for k, why in enumerate(aligned.strangers) if not why]

@@ -62,8 +62,9 @@ MOVED = 0.75
 """Correlation over well exposed pixels below which a picture shows another scene."""
 RELIT = 0.1
 """Logarithm by which places of formerly equal brightness may differ: 0.03 under the same light."""
-GAMMAS = (0.9, 2.7)
-"""Range of gammas at code 40 of cameras' responses: 1 is linear, sRGB has 2.1."""
+GAMMAS = (1.5, 2.7)
+"""Range of gammas at code 40 of cameras' 8-bit pictures: Rec. 709 has 1.7, sRGB 2.1; linear raw files need no
+estimate."""
 HATS = 8
 """Number of a response's unknowns: values at codes evenly spaced in (c / 255)^(1 / 2)."""
 
