@@ -19,7 +19,12 @@ import warp as wp
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls, make_irradiance_at
-from warp_ar.kernels.environment.lobes import level_from_roughness, level_from_shininess, sample_levels
+from warp_ar.kernels.environment.lobes import (
+    level_from_alpha,
+    level_from_roughness,
+    level_from_shininess,
+    sample_levels,
+)
 from warp_ar.kernels.environment.probe_weights import probe_weight
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import lobe_axis, make_surface, reflect, specular_occlusion
@@ -167,7 +172,8 @@ def make_find_in_frame(trace: TraceConfig) -> wp.Function:
 def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
     """``shade_unoccluded(scene, distant, hit, direction, spread) -> vec3``: radiance under the environment alone.
 
-    ``spread`` is the angle of the ray's cone.
+    ``spread`` is the angle of the ray's cone. No lobe reads the environment sharper than that: a few rays that meet a
+    curved mirror would return a lamp's whole radiance or nothing, squares of noise on what they light.
     """
     surface_at = make_surface(config.models, config.textures)
     glossy = make_reflected_radiance(config)
@@ -192,7 +198,8 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
         if wp.static(config.specular):
             if knows_levels(distant):
                 wi = lobe_axis(surface, reflect(wo, normal), normal)
-                reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
+                floor = level_from_alpha(spread, distant.level_height)
+                reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor)
                 if wp.static(config.textures):
                     reflected *= specular_occlusion(surface.occlusion, cos_o, surface.roughness)
                 radiance += wp.cw_mul(surface.reflectance, reflected)

@@ -37,11 +37,9 @@ LOCAL = ("bounce", "brute_force")
 """Methods of ``relight`` that compute ambient visibility, and light that lit surfaces reflect."""
 
 
-AREA_SAMPLES: Mapping[str, int] = MappingProxyType(
-    {"point": POINT_SAMPLES, "coarse": 8, "fine": 32, "brute_force": 256}
-)
+AREA_SAMPLES: Mapping[str, int] = MappingProxyType({"point": POINT_SAMPLES, "coarse": 4, "fine": 8, "brute_force": 256})
 """Samples of emitting objects per lit point, by method of ``area_light``."""
-AREA_CELLS: Mapping[str, tuple[int, int]] = MappingProxyType({"coarse": (16, 8), "fine": (32, 6)})
+AREA_CELLS: Mapping[str, tuple[int, int]] = MappingProxyType({"coarse": (8, 8), "fine": (16, 6)})
 """Samples of emitting objects per cell of the receiver, and pixels per cell; other methods sample at each pixel."""
 
 
