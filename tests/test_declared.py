@@ -15,7 +15,7 @@ import warp_ar
 import warp_ar.scene as sc
 from tests.test_pipeline import make_scene
 from warp_ar.engine.switcher import Target
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, WarpArError
 
 HALF = (0.5, 0.5, 0.5)
 FACING = {"camera": sc.Camera(320, 240, 300.0, 300.0, 160.0, 120.0)}
@@ -82,3 +82,19 @@ def test_maps_and_poses_have_their_shapes() -> None:
     for height, samples in ((0, 4), (8192, 4), (64, 3)):
         with pytest.raises(UsageError, match=r"Quality: (environment_height|edge_samples) = "):
             dataclasses.replace(warp_ar.PRESETS["low"], environment_height=height, edge_samples=samples)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: warp_ar.Frame(0, math.nan, np.zeros((4, 4, 3), np.uint8)), r"Frame: time = nan: expected a finite"),
+        (lambda: warp_ar.Frame(0, 0.0, None), r"Frame: image = None: expected ndarray"),
+        (lambda: warp_ar.Scene(FACING["camera"], name=""), r"Scene: name = '': expected some text"),
+        (sc.SourceSpec, r"SourceSpec: path = None: expected exactly one of path, camera and synthetic"),
+        (lambda: sc.SourceSpec(camera=0, synthetic="card"), r"synthetic = 'card': camera is given too"),
+        (lambda: warp_ar.write_environment("b.exr", MAP * np.inf), r"384 values that are NaN or infinite"),
+    ],
+)
+def test_parts_and_light_are_checked_where_they_are_given(make: Callable[[], Any], said: str) -> None:
+    with pytest.raises(WarpArError, match=said):
+        make()

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pydoc
 import re
 import subprocess
 import sys
 
+import pytest
+
 import warp_ar
+from warp_ar.scene import LambertMaterial, Object, loads_scene, sections
+
+BALL = Object("sphere", radius=0.02, material=LambertMaterial((0.5, 0.5, 0.5)))
 
 PUBLIC = {
     *(
@@ -47,6 +53,17 @@ def test_all_is_pinned_and_resolves() -> None:
     assert set(warp_ar.__all__) == PUBLIC
     for name in warp_ar.__all__:
         assert name in ("LAYERS", "PRESETS") or getattr(warp_ar, name).__doc__
+
+
+def test_former_names_warn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(warp_ar._RENAMED, "Room", "Scene")
+    with pytest.warns(DeprecationWarning, match=r"warp_ar\.Room is now Scene"):
+        assert warp_ar.Room is warp_ar.Scene
+    monkeypatch.setitem(sections.RENAMED, "object.material.hue", "base_color")
+    scene = warp_ar.load_scene("desk")
+    text = warp_ar.dumps_scene(dataclasses.replace(scene, objects=(BALL,)))
+    with pytest.warns(FutureWarning, match=r"object\[0\]\.material\.hue is now base_color"):
+        assert loads_scene(text.replace("base_color", "hue"), scene.path).objects == (BALL,)
 
 
 def test_help_names_the_fields_of_dataclasses() -> None:

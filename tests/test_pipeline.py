@@ -7,6 +7,7 @@ import dataclasses
 import math
 import os
 import re
+import signal
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -174,13 +175,24 @@ def test_threads_that_call_one_pipeline_take_turns(frames: Frames, device: str) 
     assert results == [(SIZE[1], SIZE[0], 3)] * 60
 
 
+def hold(pipeline: Pipeline, held: threading.Event, forked: threading.Event) -> None:
+    with pipeline._turn:
+        held.set()
+        forked.wait()
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_child_is_told_at_once(frames: Frames) -> None:
     with Pipeline(make_scene(), device="cpu", quality="low", size=SIZE) as pipeline:
         run(pipeline, frames[:1])
         read, write = os.pipe()
+        held, forked = threading.Event(), threading.Event()
+        thread = threading.Thread(target=lambda: hold(pipeline, held, forked))
+        thread.start()  # the fork has the lock, and not the thread that would release it
+        held.wait()
         if (child := os.fork()) == 0:
+            signal.alarm(20)
             try:
                 pipeline.close()
                 pipeline(frames[0])
@@ -192,6 +204,8 @@ def test_a_forked_child_is_told_at_once(frames: Frames) -> None:
                 os.write(write, b"; another: " + str(error).encode())
             finally:
                 os._exit(0)
+        forked.set()
+        thread.join()
         os.close(write)
         with os.fdopen(read, "rb") as told:
             first, another = told.read().split(b"; another: ")

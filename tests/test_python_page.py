@@ -47,7 +47,7 @@ def run(marker: str, **names: Any) -> dict[str, Any]:
 
 def test_the_first_lines(short: None) -> None:
     shown: list[np.ndarray] = []
-    run("show(result.image)", show=shown.append)
+    run("# result.environment", show=shown.append)
     assert len(shown) == 2
 
 
@@ -88,7 +88,7 @@ def test_a_session_in_asyncio(short: None) -> None:
     """The loop turns while frames are waited for; a task that is cancelled in a frame leaves the session closed."""
     shown: list[np.ndarray] = []
     turns: list[int] = []
-    light = run("asyncio.to_thread")["light"]
+    light = run("async for")["light"]
 
     async def turn() -> None:
         while True:

@@ -125,3 +125,11 @@ def test_threads_end_though_the_source_cannot_be_closed(monkeypatch: pytest.Monk
         session.close()
     with pytest.raises(UsageError, match="closed"):
         pipeline.warm_up()
+
+
+def test_a_former_name_warns() -> None:
+    with (
+        Session(scene(), device="cpu", quality="paper") as session,
+        pytest.warns(DeprecationWarning, match=r"Session.bracket_notes is now notes"),
+    ):
+        assert session.bracket_notes == session.notes

@@ -44,6 +44,8 @@ _HOMES = {
     "sources.sources": ("Frame", "open_source"),
     "tracking.tracking": ("TrackState", "Tracker"),
 }
+_RENAMED: dict[str, str] = {}
+"""Former public names, which work with a warning for one minor version, and their present names."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
@@ -99,6 +101,11 @@ def __getattr__(name: str) -> Any:
     Raises:
         AttributeError: There is no such name.
     """
+    if name in _RENAMED:
+        from warp_ar.errors import warn_renamed
+
+        warn_renamed(f"warp_ar.{name}", _RENAMED[name])
+        name = _RENAMED[name]
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     found = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)

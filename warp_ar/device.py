@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import warp as wp
 
-from warp_ar.errors import UsageError, say
+from warp_ar.errors import UsageError, check_process, say
 
 _ARENA_MAX = -8
 """``M_ARENA_MAX`` of glibc's ``malloc.h``."""
@@ -164,11 +164,8 @@ def start_warp() -> None:
         UsageError: This process is a fork of one that has started Warp.
     """
     wp.config.cpu_compiler_flags = CPU_COMPILER_FLAGS
-    if _STARTED and os.getpid() not in _STARTED:
-        raise UsageError(
-            f"Warp was started in process {_STARTED[0]}, of which this one is a fork without its threads and its "
-            "device; start processes by spawn"
-        )
+    if _STARTED:
+        check_process("Warp was started", _STARTED[0])
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     with _TRANSLATION:
         if not _STARTED:

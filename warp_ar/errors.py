@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 
 
@@ -30,6 +32,24 @@ class UsageError(WarpArError, ValueError):
 
 class UpdateError(UsageError):
     """Error of a scene that differs from a running pipeline's in more than numbers. The message names the part."""
+
+
+def check_process(what: str, process: int) -> None:
+    """Check that this process is the one in which something with threads or a device was made.
+
+    Raises:
+        UsageError: It is a fork of that one.
+    """
+    if os.getpid() != process:
+        raise UsageError(
+            f"{what} in process {process}, of which this one is a fork without its threads and its device; start "
+            "processes by spawn"
+        )
+
+
+def warn_renamed(old: str, new: str, category: type[Warning] = DeprecationWarning) -> None:
+    """Warn the caller's caller of a former name, which works until the next minor version."""
+    warnings.warn(f"{old} is now {new}; the old name ends with the next minor version", category, stacklevel=3)
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:

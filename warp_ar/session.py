@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import hashlib
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from warp_ar.closing import Closing
 from warp_ar.declared import checked
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.errors import UsageError, WarpArError, warn_renamed
 from warp_ar.light.captured import Light
 from warp_ar.light.card_light import light_by_card
 from warp_ar.output.environment_file import write_environment
@@ -110,8 +111,8 @@ def chosen_scene(
 class Session(Closing):
     """Opens a scene's frame source and lights its frames one after another.
 
-    Iterating yields ``(frame, result)`` pairs. Use a session in a ``with`` statement, which closes its source and
-    threads.
+    Iterating yields ``(frame, result)`` pairs; ``async for`` waits for each frame in a thread and does not block the
+    event loop. Use a session in a ``with`` statement, which closes its source and threads.
     """
 
     ahead = True
@@ -204,6 +205,12 @@ class Session(Closing):
         return Pipeline(scene, estimates="real_time" if source.live else "synchronous", linear=linear, **given)
 
     @property
+    def bracket_notes(self) -> tuple[str, ...]:
+        """Former name of ``notes``."""
+        warn_renamed("Session.bracket_notes", "notes")
+        return self.notes
+
+    @property
     def scene(self) -> Scene:
         """Scene by which frames are lit."""
         return self.pipeline.scene
@@ -259,6 +266,11 @@ class Session(Closing):
         """Return the keyword arguments of a pipeline's call for a frame."""
         pose = given_pose(self.pipeline.scene.pose, frame)
         return {"time_seconds": frame.time, "exposure_time": frame.exposure_time, "pose": pose}
+
+    async def __aiter__(self) -> AsyncIterator[tuple[Frame, Result]]:
+        frames = iter(self)
+        while (pair := await asyncio.to_thread(next, frames, None)) is not None:
+            yield pair
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline, live = self.pipeline, self.source.live

@@ -35,7 +35,7 @@ from warp_ar.engine.scene_objects import Edit, SceneObjects
 from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
-from warp_ar.errors import UpdateError, UsageError, WarpArError
+from warp_ar.errors import UpdateError, UsageError, WarpArError, check_process
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.kinds import difference
@@ -91,7 +91,8 @@ def _in_turn(method: Callable[Concatenate[Pipeline, _P], _R]) -> Callable[Concat
 
     @functools.wraps(method)
     def call(self: Pipeline, /, *arguments: _P.args, **named: _P.kwargs) -> _R:
-        with self._turn:
+        # In a fork another thread may seem to hold the lock for ever.
+        with self._turn if os.getpid() == self._process else contextlib.nullcontext():
             return method(self, *arguments, **named)
 
     return call
@@ -251,11 +252,7 @@ class Pipeline(Closing):
     def _check_usable(self) -> None:
         if self._closed:
             raise UsageError("the pipeline is closed; make another one")
-        if os.getpid() != self._process:
-            raise UsageError(
-                f"the pipeline was made in process {self._process}, of which this one is a fork without its "
-                "threads and its device; start processes by spawn"
-            )
+        check_process("the pipeline was made", self._process)
 
     @property
     def scheduler(self) -> Scheduler:

@@ -24,7 +24,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.declared import checked
-from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.errors import SinkError, UsageError, counted, reason
 from warp_ar.exr_file import exr_header, read_exr_header, read_linear_picture, write_exr
 from warp_ar.files import store
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
@@ -231,6 +231,9 @@ def check_environment(radiance: npt.NDArray[Any]) -> None:
     """
     if radiance.dtype != np.float32 or radiance.ndim != 3 or radiance.shape[2] != 3 or not radiance.size:
         raise SinkError(f"an environment is float32 (height, width, 3), not {radiance.dtype} {radiance.shape}")
+    if not np.isfinite(radiance).all():
+        wrong = int(np.count_nonzero(~np.isfinite(radiance)))
+        raise SinkError(f"an environment has {counted(wrong, 'value')} that are NaN or infinite; expected finite light")
 
 
 def encode_hdr(radiance: npt.NDArray[np.float32], axes: str) -> bytes:

@@ -144,6 +144,14 @@ class SourceSpec(Checked):
     """Metering: "fixed" (default), or "automatic" if exposure and white balance may drift: a change of all surfaces
     alike is then the camera's."""
 
+    def __post_init__(self) -> None:
+        """Check all values."""
+        super().__post_init__()
+        given = [key for key in ("path", "camera", "synthetic") if getattr(self, key) is not None]
+        if len(given) != 1:
+            also = f"{given[0]} is given too; " if given else ""
+            fail(self, given[1] if given else "path", f"{also}expected exactly one of path, camera and synthetic")
+
 
 @dataclasses.dataclass(frozen=True)
 class CharucoBoard(Checked):
@@ -746,8 +754,11 @@ class Scene:
 
         Raises:
             UsageError: A part has another type.
+            SceneError: The name is empty.
         """
         check_fields(self)
+        if not self.name:
+            fail(self, "name", "expected some text")
 
     @property
     def has_gloss(self) -> bool:

@@ -379,9 +379,9 @@ class _Reader:
         for name in required:
             if name in _COMPRESSED:
                 self._file.fail(f"it is compressed with {name}; save it without compression")
-        # A file should list all extensions that it uses; extensions of materials that it does not list are noted as
-        # well.
-        own = [item.get("extensions") for item in self._file.objects("materials")]
+        # A file should list all extensions that it uses; others are noted as well.
+        kinds = ("materials", "textures", "nodes")
+        own = [item.get("extensions") for kind in kinds for item in self._file.objects(kind)]
         found = [name for table in own if isinstance(table, dict) for name in table]
         for name in dict.fromkeys(str(name)[:60] for name in [*used, *required, *found]):
             if name not in SUPPORTED:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
 
+from warp_ar.errors import warn_renamed
 from warp_ar.files import is_file
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (
@@ -37,7 +38,6 @@ from warp_ar.scene.scene_files import SceneFiles
 from warp_ar.scene.table import Table
 
 _T = TypeVar("_T")
-_SOURCES: Final = ("path", "camera", "synthetic")
 _TRANSFERS: Final = '"srgb", "linear", "gamma:2.2" or the path of a measured response'
 _NOMINAL_SIZE: Final = (640, 480)
 """Size in pixels of a camera without calibration until the frames' size is known."""
@@ -45,6 +45,12 @@ _BOARDS: Final = (
     '"charuco COLUMNSxROWS SQUARE MARKER" or "grid COLUMNSxROWS MARKER GAP" with lengths in metres, such as '
     '"charuco 5x7 0.04 0.03"'
 )
+
+
+RENAMED: Final[dict[str, str]] = {}
+"""Former names of keys with their section, such as ``object.material.model``, and their present names without it.
+
+They work with a warning for one minor version."""
 
 
 class SceneTable(Table):
@@ -55,6 +61,12 @@ class SceneTable(Table):
 
     def __init__(self, label: str, files: SceneFiles, section: str, data: object, keys: Sequence[str]) -> None:
         """Check the keys; arguments and errors as in `Table`, with a resolver of paths in place of the folder."""
+        place = re.sub(r"\[\d+\]", "", section)
+        if isinstance(data, dict):
+            for old in [key for key in data if f"{place}.{key}" in RENAMED]:
+                new = RENAMED[f"{place}.{old}"]
+                warn_renamed(f"{label}: {section}.{old}", new, FutureWarning)
+                data = {new if key == old else key: value for key, value in data.items()}
         super().__init__(label, files.folder, section, data, keys)
         self.files = files
 
@@ -199,10 +211,6 @@ def _read_transfer(table: SceneTable) -> str | Path:
 
 def read_source(table: SceneTable) -> SourceSpec:
     """Read ``[source]``."""
-    given = [key for key in _SOURCES if key in table]
-    if len(given) != 1:
-        also = f"{given[0]} is given too; " if given else ""
-        table.fail(given[1] if given else "path", f"{also}expected exactly one of path, camera and synthetic")
     # The path's existence is checked when the source is opened, because another source may replace it.
     path = table.resolve("path", fields_of(SourceSpec)["path"].key.right) if "path" in table else None
     spec = read_fields(table, SourceSpec, path=path)

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.closing import Closing
+from warp_ar.declared import check_fields
 from warp_ar.errors import SourceError, UsageError, reason
 from warp_ar.files import kind_of
 from warp_ar.sources.deep_frame import DeepFrame
@@ -62,6 +63,10 @@ class Frame:
 
     begins: int = 0
     """Index of the first frame of the current pass over a looped clip."""
+
+    def __post_init__(self) -> None:
+        """Check the types, and that times are finite."""
+        check_fields(self)
 
     @property
     def deepest(self) -> DeepFrame | Image:
