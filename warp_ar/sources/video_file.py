@@ -154,7 +154,7 @@ class VideoFile(RecordedSource):
             first, previous = None, -math.inf
             for index, (image, stamp, deep) in enumerate(self._pictures(container)):
                 check_size(image, self.size, str(self._path), index)
-                if self._retimed or stamp is None:
+                if self._retimed or stamp is None or not math.isfinite(stamp):
                     seconds = index / self.fps if self._retimed or index == 0 else previous + 1.0 / self.fps
                 else:
                     first = stamp if first is None else first
