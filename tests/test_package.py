@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 import warp_ar
@@ -59,6 +60,9 @@ def test_former_names_warn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(warp_ar._RENAMED, "Room", "Scene")
     with pytest.warns(DeprecationWarning, match=r"warp_ar\.Room is now Scene"):
         assert warp_ar.Room is warp_ar.Scene
+    frame = warp_ar.Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8))
+    with pytest.warns(DeprecationWarning, match=r"Frame\.plate is now deep"):
+        assert frame.plate is None
     monkeypatch.setitem(sections.RENAMED, "object.material.hue", "base_color")
     scene = warp_ar.load_scene("desk")
     text = warp_ar.dumps_scene(dataclasses.replace(scene, objects=(BALL,)))

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from warp_ar.closing import Closing
 from warp_ar.declared import check_fields
-from warp_ar.errors import SourceError, UsageError, reason
+from warp_ar.errors import SourceError, UsageError, reason, warn_renamed
 from warp_ar.files import kind_of
 from warp_ar.sources.deep_frame import DeepFrame
 
@@ -67,6 +67,12 @@ class Frame:
     def __post_init__(self) -> None:
         """Check the types, and that times are finite."""
         check_fields(self)
+
+    @property
+    def plate(self) -> DeepFrame | None:
+        """Former name of ``deep``."""
+        warn_renamed("Frame.plate", "deep")
+        return self.deep
 
     @property
     def deepest(self) -> DeepFrame | Image:
