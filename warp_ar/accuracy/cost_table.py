@@ -66,8 +66,8 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
         "light of objects that emit",
         {
             "point": "as a point in its middle",
-            "coarse": "8 samples per point of objects; 16 per 8x8 pixels of receivers",
-            "fine": "32 samples; 32 per 6x6 pixels of receivers",
+            "coarse": "4 samples per point of objects; 8 per 8x8 pixels of receivers",
+            "fine": "8 samples; 16 per 6x6 pixels of receivers",
             "brute_force": "256 samples per point",
         },
     ),
