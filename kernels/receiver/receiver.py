@@ -37,10 +37,9 @@ from warp_ar.kernels.color import luminance
 from warp_ar.kernels.environment.interpolated_irradiance import OtherBalls, make_irradiance_at
 from warp_ar.kernels.picture.summed_area import intensity
 from warp_ar.kernels.pixels import cut_luma, shown_radiance
-from warp_ar.kernels.rays.shapes import surface_key
 from warp_ar.kernels.rays.trace import TraceConfig
 from warp_ar.kernels.rays.visibility import check_edge_samples
-from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayScene, filled
+from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -180,12 +179,9 @@ class Receiver:
 
 
 @wp.func
-def look_up_receiver(
-    scene: RayScene, receiver: Receiver, cells: SurfaceCells, hit: Hit, row: wp.int32, col: wp.int32
-) -> wp.vec4:
-    """Return (value, 1) of the receiver's cells at the point that a pixel shows; zero if no cell has it."""
-    size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
-    return look_up_cells(cells, surface_key(scene, hit), size, row, col)
+def frame_size(receiver: Receiver) -> wp.vec2i:
+    """Return rows and columns of the frame."""
+    return wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
 
 
 @wp.struct
@@ -200,13 +196,13 @@ class Matter:
 
 @functools.cache
 def make_find_matter(config: RelightConfig) -> wp.Function:
-    """``find_matter(scene, receiver, hit, row, col, mirror) -> Matter``; arguments as those of ``direct_lighting``."""
+    """``find_matter(receiver, hit, key, row, col, mirror) -> Matter``; ``key`` is the hit's ``surface_key``."""
     method, reading = config.method, READINGS.get(config.method)
     irradiance_at = make_irradiance_at(config.irradiance, config.emitters, config.several)
 
     @wp.func(module="unique")
     def find_matter(
-        scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32, mirror: wp.vec3
+        receiver: Receiver, hit: Hit, key: wp.int32, row: wp.int32, col: wp.int32, mirror: wp.vec3
     ) -> Matter:
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
@@ -229,7 +225,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
             )
             if wp.static(config.ambient_visibility):
                 if not is_mirrored:
-                    left = look_up_receiver(scene, receiver, receiver.cells.ambient, hit, row, col)
+                    left = look_up_cells(receiver.cells.ambient, key, frame_size(receiver), row, col)
                     if left[3] > 0.0:
                         distant = wp.cw_mul(distant, wp.vec3(left[0], left[1], left[2]))
             matter.kd = wp.vec3(

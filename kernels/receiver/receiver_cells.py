@@ -40,7 +40,7 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.cells import SurfaceCells, cell_pixel
+from warp_ar.kernels.cells import SurfaceCells, cell_pixel, look_up_cells
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample, Incidence, ball_of_sample, sample_toward
 from warp_ar.kernels.environment.interpolated_irradiance import make_irradiance_at
 from warp_ar.kernels.environment.probe_weights import probe_share
@@ -56,7 +56,7 @@ from warp_ar.kernels.receiver.receiver import (
     Matter,
     Receiver,
     RelightConfig,
-    look_up_receiver,
+    frame_size,
 )
 from warp_ar.kernels.receiver.relight import make_area_response, make_direct_lighting
 from warp_ar.kernels.structs import MIRROR, PHONG, PLANE, FrameParams, Hit, Light, RayScene
@@ -65,8 +65,8 @@ wp.set_module_options({"enable_backward": False})
 
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 """Irradiance, in camera values, below which ambient visibility is taken to be 1."""
-NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
-"""Ratio of bounced to environment light that is treated as 0: at most an eighth of an 8-bit code."""
+NEGLIGIBLE = wp.constant(wp.float32(1.0 / 256.0))
+"""Ratio of bounced to environment light that is treated as 0: at most half an 8-bit code."""
 MIN_FACING = wp.constant(wp.float32(0.02))
 """Least cosine by which the area of a patch is divided: at smaller ones it would reach over the horizon."""
 
@@ -241,7 +241,7 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
         if bounced:
             i = cell_pixel(ci, stride, rays.shape[0])
             j = cell_pixel(cj, stride, rays.shape[1])
-            sent = look_up_receiver(scene, receiver, receiver.cells.bounced, hit, i, j)
+            sent = look_up_cells(receiver.cells.bounced, surface_key(scene, hit), frame_size(receiver), i, j)
             needed = sent[0] + sent[1] + sent[2] > 0.0
         else:
             needed = is_shone_on(lights, hit)

@@ -24,7 +24,7 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.cells import any_cell_above_zero
+from warp_ar.kernels.cells import any_cell_above_zero, look_up_cells
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, row_launcher
 from warp_ar.kernels.rays.area_lights import make_area_count, make_area_sample
@@ -41,10 +41,11 @@ from warp_ar.kernels.rays.trace import make_trace, meets_probe
 from warp_ar.kernels.rays.visibility import inside_rect, make_sample_direction
 from warp_ar.kernels.receiver.receiver import (
     DEFAULT_REFLECTANCE,
+    READINGS,
     Matter,
     Receiver,
     RelightConfig,
-    look_up_receiver,
+    frame_size,
     make_find_matter,
     make_respond,
 )
@@ -108,6 +109,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
     is_lit = make_shadow(config.trace)
     visible_share = make_visible_share(config.trace) if config.soft else None
     find_matter, respond = make_find_matter(config), make_respond(config.method)
+    blends = config.method in READINGS
     area_response = make_area_response(config) if config.area_samples > 0 else None
 
     @wp.func(module="unique")
@@ -122,9 +124,12 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
         turn: wp.float32,
     ) -> DirectLighting:
         result = DirectLighting()
-        known = bool(False)  # whether ``matter`` was found; it is needed only if light falls here
+        key = surface_key(scene, hit)
+        size = frame_size(receiver)
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
+        if wp.static(blends):
+            matter = find_matter(receiver, hit, key, row, col, mirror)
         added = wp.vec3()
         for index in range(lights.shape[0]):
             light = sample_light(lights[index], hit.point)
@@ -147,22 +152,14 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                 result.visibility |= bit
                 continue
             result.visibility |= _LIT
-            if wp.static(config.method != "flat"):
-                if not known:
-                    known = True
-                    matter = find_matter(scene, receiver, hit, row, col, mirror)
             added += visible * respond(matter, light.wi, n_dot_l) * light.irradiance_normal
         if wp.static(config.area_samples > 0):
             if scene.area_lights.shape[0] > 0:
                 stored = wp.vec4()
                 if wp.static(config.area_cells):
                     if mirror[0] <= 0.0:
-                        stored = look_up_receiver(scene, receiver, receiver.cells.area, hit, row, col)
+                        stored = look_up_cells(receiver.cells.area, key, size, row, col)
                 by_areas = wp.vec3(stored[0], stored[1], stored[2])
-                if wp.static(config.method != "flat"):
-                    if not known and (stored[3] <= 0.0 or wp.max(by_areas) > 0.0):
-                        known = True
-                        matter = find_matter(scene, receiver, hit, row, col, mirror)
                 if stored[3] <= 0.0:
                     by_areas = area_response(scene, receiver, hit, matter, turn)
                 if wp.max(by_areas) > 0.0:
@@ -170,12 +167,13 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                     added += by_areas
         if wp.static(config.bounced):
             if mirror[0] <= 0.0:
-                bounced = look_up_receiver(scene, receiver, receiver.cells.bounced, hit, row, col)
+                bounced = look_up_cells(receiver.cells.bounced, key, size, row, col)
                 if bounced[0] + bounced[1] + bounced[2] > 0.0:
                     result.visibility |= _LIT
-                    if not known:
-                        matter = find_matter(scene, receiver, hit, row, col, mirror)
                     added += wp.vec3(bounced[0], bounced[1], bounced[2])
+        if wp.static(config.method == "reflectance"):
+            if wp.max(added) > 0.0:
+                matter = find_matter(receiver, hit, key, row, col, mirror)
         result.added = wp.cw_mul(matter.kd, added) * _INV_PI
         return result
 
@@ -210,8 +208,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
             visibility_out[i, j] = _NOTHING
         if wp.static(config.bounced):
             if not inside_rect(i, j, params[0].direct_rect):
-                size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
-                if not any_cell_above_zero(receiver.cells.bounced, size, i, j):
+                if not any_cell_above_zero(receiver.cells.bounced, frame_size(receiver), i, j):
                     return
         ray = receiver.picture.rays[i, j]
         direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)

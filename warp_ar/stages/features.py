@@ -32,9 +32,9 @@ FLAT = "flat"
 NEAR = ("few_rays", "one_bounce")
 """Methods of ``shade`` that include the close surroundings of objects."""
 MEASURED = ("reflectance", "bounce", "brute_force")
-"""Methods of ``relight`` that derive the receiver's reflectance from the environment's irradiance."""
+"""Methods of ``relight`` that derive the receiver's reflectance from the environment's light that reaches it."""
 LOCAL = ("bounce", "brute_force")
-"""Methods of ``relight`` that compute ambient visibility, and light that lit surfaces reflect."""
+"""Methods of ``relight`` that add virtual light that lit surfaces reflect."""
 
 
 AREA_SAMPLES: Mapping[str, int] = MappingProxyType({"point": POINT_SAMPLES, "coarse": 4, "fine": 8, "brute_force": 256})
@@ -167,6 +167,7 @@ def find_features(request: Request) -> Features:
     darkened = exposed and (isinstance(scale, str) or scale < 1.0)
     relight_method = quality.method("relight") if environment else FLAT
     shines = sheds_light(scene)
+    hidden = bool(scene.probes) or any(proxy.shape != "plane" for proxy in scene.proxies)
     lit_by_both = bool(environment and shines and scene.proxies)
     area_samples = AREA_SAMPLES[area_method(quality)] if any(map(emits_light, scene.objects)) else 0
     placed = recovered or (environment and not observed and request.emitters)
@@ -188,7 +189,7 @@ def find_features(request: Request) -> Features:
         declipped=darkened and quality.method("expose") == "ball",
         declipped_by_ball=quality.method("expose") == "ball" and recovered,
         relight_method=relight_method,
-        ambient_visibility=lit_by_both and relight_method in LOCAL,
+        ambient_visibility=lit_by_both and hidden and relight_method in MEASURED,
         bounced=relight_method in LOCAL and proxies_face(scene),
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
         area_samples=area_samples,

@@ -37,8 +37,11 @@ class Grain:
     """Pixels per patch that reflects bounced light, likewise."""
 
 
-GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
-"""Resolutions of the methods with local light; otherwise these methods equal ``reflectance``."""
+_GRAIN = Grain(128, 4, 8, 16)
+GRAINS: Mapping[str, Grain] = MappingProxyType(
+    {"reflectance": _GRAIN, "bounce": _GRAIN, "brute_force": Grain(SAMPLES, 1, 1, 4)}
+)
+"""Resolutions of the methods that measure the receiver's reflectance."""
 
 
 class Relight(Stage):
@@ -48,8 +51,8 @@ class Relight(Stage):
     methods: ClassVar[Mapping[str, str]] = {
         "flat": "on a grey receiver",
         "paper": "blended by the frame's brightness",
-        "reflectance": "times reflectance from frame and environment",
-        "bounce": "the same with the environment's shadows and light between lit surfaces",
+        "reflectance": "times reflectance from frame and environment, with its shadows",
+        "bounce": "the same, and light that lit surfaces reflect to each other",
         "brute_force": "the same at every pixel, 1,024 rays, patches of 4 pixels",
     }
     summary: ClassVar[str] = "virtual light and its shadows on the receiver"
