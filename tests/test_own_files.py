@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import pathlib
@@ -60,15 +59,9 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: pathlib.Path) -> None:
         OwnFiles(tmp_path, ["a.md"], overwrite=True)
 
 
-# --- Files set aside: random names, created new, no link followed, and one place that does it -------------------------
+# --- Files set aside: random names, created new, no link followed ----------------------------------------------------
 
 
-ROOT = pathlib.Path(__file__).parents[1] / "warp_ar"
-RENAMERS = {"os.replace", "os.rename", "os.renames", "shutil.move", "os.link", "os.symlink"}
-OPENERS = {"files.py", "farm/manifest.py", "farm/pools.py"}
-"""Files that may create files by descriptor; the farm's are a lock and a log inside its own folder."""
-PRIVATE = ("farm/plan.py",)
-"""Files that rename inside a folder of the program's own, where nobody else writes."""
 FRAME = np.zeros((32, 32, 3), np.uint8)
 PATIENCE = 120.0
 """Seconds within which a file appears on a busy machine."""
@@ -172,31 +165,6 @@ def test_a_folder_that_is_removed_while_a_video_is_written_is_said(tmp_path: pat
     folder.rmdir()
     with pytest.raises(SinkError, match="removed while it was written"):
         sink.close()
-
-
-def test_one_place_sets_files_aside_and_renames() -> None:
-    found = []
-    for path in sorted(ROOT.rglob("*.py")):
-        place = path.relative_to(ROOT).as_posix()
-        if place in ("files.py", *PRIVATE) or place.startswith("kernels/"):
-            continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Attribute) and node.attr == "O_CREAT" and place not in OPENERS:
-                found.append(f"{place}:{node.lineno}: O_CREAT")
-            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
-                continue
-            text = ast.unparse(node.func)
-            one = len(node.args) == 1 and not node.keywords  # Path.replace takes one, str.replace two arguments
-            if (
-                text in RENAMERS
-                or node.func.attr in ("rename", "mkstemp", "mktemp")
-                or (node.func.attr == "replace" and one and not text.startswith("dataclasses."))
-            ):
-                found.append(f"{place}:{node.lineno}: {text}")
-    assert found == []
-
-
-# --- Lines of a long run that are kept, so that it goes on where it was ended -----------------------------------------
 
 
 # --- Files that this program writes are known as its own; others are not, whatever they hold --------------------------

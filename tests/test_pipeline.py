@@ -26,7 +26,6 @@ from warp_ar.scene import (
     Marker,
     MetallicRoughnessMaterial,
     Object,
-    Pose,
     Probe,
     Proxy,
     Scene,
@@ -245,13 +244,6 @@ def test_poses_and_scenes_that_are_none_are_refused_by_name(frames: Frames) -> N
         with pytest.raises(UsageError, match=r"scene = .*: expected Scene"):
             pipeline.update("desk")  # type: ignore[arg-type]
         assert pipeline(frames[0]).image.any()
-    for rotation, translation, wrong in (
-        (np.eye(4), np.zeros(3), r"rotation has the shape \(4, 4\)"),
-        (np.eye(3), np.zeros((3, 1)), r"translation has the shape \(3, 1\)"),
-        (None, np.zeros(3), "rotation is NoneType"),
-    ):
-        with pytest.raises(UsageError, match=wrong):
-            Pose(rotation, translation)  # type: ignore[arg-type]
 
 
 def test_impossible_exposures_are_refused() -> None:

@@ -113,7 +113,7 @@ def sample(levels, height, at, level):
 # --- Where levels lie -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("height", [1, 2, 3, 4, 5, 7, 8, 16, 33, 64, 100, 128, 256])
+@pytest.mark.parametrize("height", [1, 2, 3, 7, 33, 64, 256])
 def test_levels_and_widths_fit_the_map(device, height):
     count = lobe_count(height)
     assert lobe_alpha(height, count - 1) == 1.0

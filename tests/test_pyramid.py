@@ -10,18 +10,13 @@ from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_directi
 ROUNDING = 3e-6
 # Sizes of a level: square numbers, odd ones, single rows, columns and texels.
 SIZES = [
-    (256, 512),
     (64, 128),
-    (16, 32),
     (8, 64),
-    (12, 24),
-    (5, 10),
     (7, 13),
     (33, 66),
     (1, 9),
     (9, 1),
     (1, 1),
-    (3, 17),
 ]
 
 

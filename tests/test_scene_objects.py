@@ -186,20 +186,6 @@ def test_a_pipeline_names_what_it_cannot_take(given, told) -> None:
         Pipeline(**{"scene": make_scene(), "device": "cpu", **given})
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "told"),
-    [
-        ("objects", (3,), ".3,.: expected a tuple of any number of times Object"),
-        ("objects", BALL, "Object.*: expected a tuple of any number of times Object"),
-        ("camera", None, "None: expected Camera"),
-        ("proxies", (BALL,), ".*: expected a tuple of any number of times Proxy"),
-    ],
-)
-def test_a_scene_names_what_it_cannot_take(field, value, told) -> None:
-    with pytest.raises(UsageError, match=f"Scene: {field} = {told}"):
-        dataclasses.replace(make_scene(), **{field: value})
-
-
 def test_numbers_of_numpy_find_objects() -> None:
     with Pipeline(named(), device="cpu", quality="paper") as pipeline:
         assert pipeline.objects[np.int64(1)].value == named().objects[1]

@@ -435,38 +435,6 @@ def test_moving_marker_does_not_lag():
         assert np.abs(a.corners - b.corners).max() < STEADY_PIXELS
 
 
-@pytest.mark.parametrize(
-    ("marker", "said"),
-    [
-        ({"dictionary": "DICT_4X4"}, 'dictionary = .DICT_4X4.: unknown; did you mean "DICT_4X4_'),
-        ({"dictionary": "4X4_50"}, 'did you mean "DICT_4X4_50"'),
-        ({"dictionary": ""}, "expected a name such as DICT_4X4"),
-        ({"id": 50}, "0 to 49"),
-        ({"size": 0.0}, "size = 0.0: expected a number above 0"),
-        ({"board": 3}, "board = 3: expected CharucoBoard or GridBoard"),
-        ({"board": GridBoard(40, 30, 0.04, 0.01)}, "needs 1200 markers"),
-    ],
-)
-def test_impossible_markers(marker, said):
-    with pytest.raises(SceneError, match=said):
-        Marker(**marker)
-
-
-@pytest.mark.parametrize(
-    ("kind", "numbers", "said"),
-    [
-        (GridBoard, (0, 3, 0.04, 0.01), "columns = 0: expected a whole number from 1"),
-        (GridBoard, (4, 3, 0.04, -1.0), "separation = -1.0: expected a number above 0"),
-        (CharucoBoard, (5, 1, 0.04, 0.03), "rows = 1: expected a whole number from 2"),
-        (CharucoBoard, (5, 4, 0.03, 0.03), "smaller than its square"),
-        (CharucoBoard, (5, 4, np.nan, 0.03), "square_length = nan: expected a number above 0"),
-    ],
-)
-def test_impossible_boards(kind, numbers, said):
-    with pytest.raises(SceneError, match=said):
-        kind(*numbers)
-
-
 def test_wrong_image():
     tracker = Tracker(Marker(), CAMERA)
     for image in (

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,7 +17,6 @@ from tests.test_node_animation import moving
 from tests.viewer_rig import PATIENCE, SIZE, Running, jpeg, page_scene
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.output.environment_file import read_environment
 from warp_ar.scene import Animation, Object, Play, loads_scene
 from warp_ar.sources.sources import QueueSource, Synthetic
 from warp_ar.viewer.controls import Feed
@@ -317,15 +315,6 @@ def test_the_browsers_camera_is_the_source_until_it_leaves(tmp_path: Path) -> No
         assert host.camera_size("me") == SIZE
         host.leave_camera("me")
         running.until(lambda: len(running.frames) > start + 2 and running.frames[-1].stamp is None)
-
-
-def test_downloads_of_the_light_and_the_picture(running: Running, tmp_path: Path) -> None:
-    running.until(lambda: running.host.light_state is not None)
-    path = tmp_path / "light.exr"
-    path.write_bytes(running.host.environment_exr())
-    assert read_environment(path).shape == (64, 128, 3)
-    picture = cv2.imdecode(np.frombuffer(running.host.snapshot(), np.uint8), cv2.IMREAD_COLOR)
-    assert picture.shape == running.frames[-1].image.shape
 
 
 def test_the_scene_moves_on_when_the_source_starts_again() -> None:
