@@ -29,7 +29,7 @@ import warp as wp
 
 from warp_ar.errors import SceneError
 from warp_ar.files import is_file, read_text
-from warp_ar.srgb import decode_srgb
+from warp_ar.srgb import TRANSFERS, decode_srgb, exponent_of, is_formula
 
 wp.set_module_options({"enable_backward": False})
 
@@ -153,7 +153,7 @@ def decode_codes(transfer: str | pathlib.Path, encoded: np.ndarray) -> np.ndarra
         (n, 3) float64.
     """
     name = str(transfer)
-    if name in ("srgb", "linear") or name.startswith("gamma:"):
+    if is_formula(name):
         return np.repeat(_formula(name, encoded)[:, None], 3, axis=1)
     values, codes = _decode_values(transfer), np.arange(256) / 255.0
     return np.stack([np.interp(encoded, codes, values[:, c]) for c in range(3)], -1)
@@ -170,12 +170,10 @@ def encode_codes(transfer: str | pathlib.Path, light: np.ndarray) -> np.ndarray:
         float64 of the same shape, 0 to 1.
     """
     name, x = str(transfer), np.clip(np.nan_to_num(np.asarray(light, np.float64), nan=0.0), 0.0, 1.0)
-    if name == "linear":
-        return x
     if name == "srgb":
         return np.where(x <= 0.04045 / 12.92, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
-    if name.startswith("gamma:"):
-        return x ** (1.0 / _gamma(name))
+    if (gamma := exponent_of(name)) is not None:
+        return x ** (1.0 / gamma)
     values, codes = _decode_values(transfer), np.arange(256) / 255.0
     return np.stack([np.interp(x[..., c], values[:, c], codes) for c in range(3)], -1)
 
@@ -232,7 +230,7 @@ def encode_table(
     """
     half_codes = (np.arange(255) + 0.5) / 255.0
     name = str(transfer)
-    if contrast == 0.0 and (name == "linear" or name == "srgb" or name.startswith("gamma:")):
+    if contrast == 0.0 and is_formula(name):
         exact = np.repeat(_formula(name, half_codes)[:, None], 3, axis=1)
     else:
         values = without_contrast(_decode_values(transfer), contrast, saturation)
@@ -257,33 +255,17 @@ def encode_table(
 
 def _formula(name: str, encoded: np.ndarray) -> np.ndarray:
     """Return the linear value of encoded values, 0 to 1, for a transfer that has a formula."""
-    if name == "linear":
-        return encoded
-    if name == "srgb":
-        return decode_srgb(encoded)
-    return encoded ** _gamma(name)
-
-
-def _gamma(name: str) -> float:
-    try:
-        gamma = float(name.removeprefix("gamma:"))
-    except ValueError:
-        gamma = float("nan")
-    if not 0.1 <= gamma <= 10.0:
-        raise SceneError(f"camera.transfer = {name!r}: the exponent must be a number from 0.1 to 10, as in 'gamma:2.2'")
-    return gamma
+    return decode_srgb(encoded) if name == "srgb" else encoded ** exponent_of(name)
 
 
 def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
     """Return the linear values of all codes, (256, 3) float64."""
     name = str(transfer)
-    if name in ("srgb", "linear") or name.startswith("gamma:"):
+    if is_formula(name):
         return np.repeat(_formula(name, np.arange(256) / 255.0)[:, None], 3, axis=1)
     path = pathlib.Path(transfer)
     if not is_file(path):
-        raise SceneError(
-            f"camera.transfer = {name!r}: neither 'srgb', 'linear', 'gamma:2.2' nor the path of a measured response"
-        )
+        raise SceneError(f"camera.transfer = {name!r}: expected {TRANSFERS}")
     text = read_text(path, SceneError, expected="256 lines of three linear values")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     expected = f"{path}: a measured response is 256 lines of three linear values"

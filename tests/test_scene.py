@@ -396,7 +396,7 @@ ERRORS = [
     (CAMERA.replace("cx = 319.5", "cx = 0x" + "f" * 8000), r"camera\.cx = a number of thousands of digits: "),
     (CAMERA + "distortion = [0, 0, 0]", r"camera\.distortion = \[0, 0, 0\]: expected a list of 4 or 5 or 8 numbers"),
     (CAMERA + "transfer = 'sRGBB'", r'camera\.transfer = "sRGBB": expected "srgb", "linear".*no such file: .*sRGBB'),
-    (CAMERA + "transfer = 'gamma:x'", r'camera\.transfer = "gamma:x": expected a gamma from 0\.1 to 10'),
+    (CAMERA + "transfer = 'gamma:x'", r'camera\.transfer = "gamma:x": expected "srgb".*"gamma:2\.2" \(0\.1 to 10\)'),
     (CAMERA + "calibration = 'notes.txt'", r"camera\.width = 640: not used beside calibration"),
     # The source.
     (BASE + "[source]\nfps = 3", r"source\.path is missing: expected exactly one of path, camera and synthetic"),
@@ -583,6 +583,7 @@ def test_a_users_own_scene_names_any_file(tmp_path: pathlib.Path) -> None:
         (sc.GridBoard, {"columns": 0, "rows": 3, "marker_length": 0.04, "separation": 0.01}, "columns = 0: expected a"),
         (sc.CapturedLight, {"file": 3}, "file = 3: expected a path"),
         (sc.AreaLight, {"kind": "rect", "intensity": 1, "at": (0, 0, 1)}, "expected 2 lengths above 0"),
+        (sc.Camera.guessed, {"width": 9, "height": 9, "field_of_view": 60.0, "transfer": "foo"}, "transfer = 'foo'"),
     ],
 )
 def test_what_cannot_be_is_named(make: Any, values: dict[str, Any], message: str) -> None:

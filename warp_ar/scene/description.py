@@ -19,10 +19,12 @@ import numpy.typing as npt
 
 from warp_ar.declared import check_fields
 from warp_ar.errors import SceneError
+from warp_ar.files import is_file
 from warp_ar.scene.fields import LIGHT_COLOR, Checked, Key, Length, Place, Share, Turn, Vec3, fail
 from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.materials import OF_THE_FILE, RGB, EmissiveMaterial, Material
 from warp_ar.scene.messages import MOST_PIXELS, SMALLEST
+from warp_ar.srgb import TRANSFERS, is_formula
 
 FloatMatrix: TypeAlias = npt.NDArray[np.float64]
 
@@ -65,6 +67,12 @@ class Camera(Checked):
     field_of_view: Annotated[float | None, Key("degrees", "60.0", low=5.0, high=150.0)] = None
     """Horizontal field of view, degrees, of an uncalibrated camera instead of its numbers. Assumes square pixels, a
     central principal point and no distortion; fits any frame size."""
+
+    def __post_init__(self) -> None:
+        """Check all values."""
+        super().__post_init__()
+        if isinstance(self.transfer, str) and not is_formula(self.transfer) and not is_file(self.transfer):
+            fail(self, "transfer", f"expected {TRANSFERS}")
 
     @classmethod
     def guessed(cls, width: int, height: int, field_of_view: float, transfer: str | Path = "srgb") -> Camera:

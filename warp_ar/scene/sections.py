@@ -36,9 +36,9 @@ from warp_ar.scene.messages import SMALLEST
 from warp_ar.scene.pose_file import check_rotation, load_pose_file, pose_of_position, rotation_of_quaternion
 from warp_ar.scene.scene_files import SceneFiles
 from warp_ar.scene.table import Table
+from warp_ar.srgb import TRANSFERS, is_formula
 
 _T = TypeVar("_T")
-_TRANSFERS: Final = '"srgb", "linear", "gamma:2.2" or the path of a measured response'
 _NOMINAL_SIZE: Final = (640, 480)
 """Size in pixels of a camera without calibration until the frames' size is known."""
 _BOARDS: Final = (
@@ -192,20 +192,12 @@ def read_camera(table: SceneTable, source: object = None) -> Camera:
 
 
 def _read_transfer(table: SceneTable) -> str | Path:
-    value = table.text("transfer", "srgb", right=_TRANSFERS)
-    if value in ("srgb", "linear"):
+    value = table.text("transfer", "srgb", right=TRANSFERS)
+    if is_formula(value):
         return value
-    if value.startswith("gamma:"):
-        try:
-            gamma = float(value.removeprefix("gamma:"))
-        except ValueError:
-            gamma = math.nan
-        if not 0.1 <= gamma <= 10.0:
-            table.fail("transfer", 'expected a gamma from 0.1 to 10, such as "gamma:2.2"')
-        return value
-    path = table.resolve("transfer", _TRANSFERS)
+    path = table.resolve("transfer", TRANSFERS)
     if not is_file(path):
-        table.fail("transfer", f"expected {_TRANSFERS}; no such file: {path}")
+        table.fail("transfer", f"expected {TRANSFERS}; no such file: {path}")
     return path
 
 
