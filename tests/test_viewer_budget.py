@@ -14,7 +14,8 @@ import pytest
 from tests.test_budget import even_costs
 from tests.viewer_rig import PATIENCE, SIZE, Running, page_scene
 from warp_ar.accuracy.controller import AIM
-from warp_ar.accuracy.cost_table import SETTINGS, load_presets
+from warp_ar.accuracy.cost_table import SETTINGS, chosen, load_presets
+from warp_ar.accuracy.costs import BASE, Costs
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.scene import Scene, load_scene
 from warp_ar.viewer import budget as budget_setting
@@ -36,7 +37,8 @@ def known_errors(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def measured_steps(scene: Scene, image: Any, pose: Any, device: str, size: Any, settings: Any) -> Any:
     """What ``measure_steps`` gives on a device that has time for one method more than the base's, and for no other."""
-    yield 0.5
+    yield 0.25, None
+    yield 0.5, Costs(20.0, {setting.name: {chosen(BASE, setting): 0.0} for setting in settings})
     return even_costs(settings, base=20.0, most=1.0)
 
 
@@ -59,10 +61,14 @@ def test_what_the_budget_offers_is_what_it_chooses(known_errors: None, tmp_path:
             while not told[-1]["known"]:
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
-        assert [m["measuring"] for m in told[1:]] == [0.0, 0.5, None]
+        assert [m["measuring"] for m in told[1:]] == [0.0, 0.25, 0.5, None]
+        # What is known so far can be drawn, and is not chosen yet.
+        assert "choices" not in told[2]
+        assert [choice["ms"] for choice in told[3]["choices"]] == [0.0]
+        assert not told[3]["known"]
         # After half of it the rest takes as long again.
         assert told[1]["remaining"] is None
-        assert 0.0 <= told[2]["remaining"] < PATIENCE
+        assert 0.0 <= told[3]["remaining"] < PATIENCE
         record = json.loads(json.dumps(told[-1]))
         times = [choice["ms"] for choice in record["choices"]]
         errors = [choice["error"] for choice in record["choices"]]

@@ -197,9 +197,9 @@ def test_costs_that_cannot_be_measured_are_told_once(
 ) -> None:
     began: list[None] = []
 
-    def steps(*_: Any) -> Iterator[float]:
+    def steps(*_: Any) -> Iterator[tuple[float, None]]:
         began.append(None)
-        yield 0.5
+        yield 0.5, None
         raise fault
 
     monkeypatch.setattr(budget_setting, "measure_steps", steps)

@@ -90,8 +90,8 @@ def measure_steps(
     clock: Callable[[], float] | None = None,
     *,
     all_methods: bool = False,
-) -> Generator[float, None, Costs]:
-    """Time methods on one repeated frame, in small steps; yield the completed share, and return the costs.
+) -> Generator[tuple[float, Costs | None], None, Costs]:
+    """Time methods on one repeated frame, in small steps; yield the completed share with the costs so far; return all.
 
     Args:
         scene: Scene that is shown.
@@ -109,29 +109,30 @@ def measure_steps(
     timed = WORK if clock is None else clock
     passed = _time_stages(scene, image, pose, device, size, BASE, time.perf_counter)
     track = passed.pop(TRACK, 0.0)
-    yield 1 / count
+    yield 1 / count, None
     base = _time_stages(scene, image, pose, device, size, BASE, timed)
     base.pop(TRACK, None)
-    yield done / count
     work = sum(base.values())
     pace = sum(passed.values()) / work if clock is None and work > 0.0 else 1.0
-    costs: dict[str, dict[str, float]] = {}
+    costs = {setting.name: {chosen(BASE, setting): 0.0} for setting in methods}
+    known = Costs(track + pace * work, costs, track)
+    yield done / count, known
     for setting, names in methods.items():
         start, spread = chosen(BASE, setting), setting.name == NOW_AND_THEN
         times: dict[str, dict[str, float]] = {}
-        for method in names:
+        for method in sorted(names, key=lambda name: name != start):
             times[method] = base
             if method != start or spread:
                 quality = turn(BASE, {setting.name: method})
                 times[method] = _time_stages(scene, image, pose, device, size, quality, timed, spread)
                 times[method].pop(TRACK, None)
             done += 1
-            yield done / count
-        # Stages that all methods of a setting share cost the same; measured differences between them are noise.
-        common = set.intersection(*(set(own) for own in times.values())) - set(setting.stages)
-        own = {method: sum(ms for name, ms in stages.items() if name not in common) for method, stages in times.items()}
-        costs[setting.name] = {method: pace * (ms - own[start]) for method, ms in own.items()}
-    return Costs(track + pace * work, costs, track)
+            # Stages that all methods of a setting share cost the same; measured differences between them are noise.
+            common = set.intersection(*map(set, times.values())) - set(setting.stages)
+            own = {one: sum(ms for name, ms in stages.items() if name not in common) for one, stages in times.items()}
+            costs[setting.name] = {one: pace * (own[one] - own[start]) for one in names if one in own}
+            yield done / count, known
+    return known
 
 
 def _time_stages(

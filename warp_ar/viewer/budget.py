@@ -109,16 +109,17 @@ class BudgetSetting:
             steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._settings)
             begin(helper, self._notify, self._step, helper, steps, key)
 
-    def _step(self, helper: Executor, steps: Generator[float, None, Costs], key: str) -> None:
+    def _step(self, helper: Executor, steps: Generator[tuple[float, Costs | None], None, Costs], key: str) -> None:
         progress = None
         try:
             if not self.stopped:
-                progress = next(steps)
+                progress, costs = next(steps)
+                self._offer = self._list(Controller(costs, self._errors, self.last_budget), costs) if costs else {}
         except StopIteration as end:
             write_costs(self._folder, self._cache_key, end.value)
             self._adopt(end.value)
         except Exception as error:
-            self._failed = key  # otherwise the next frame would start the same measurement again
+            self._failed, self._offer = key, {}  # otherwise the next frame would start the same measurement again
             self._notify(failure(error, "the costs of methods stay unknown"))
         finally:
             self._progress = progress
@@ -171,11 +172,13 @@ class BudgetSetting:
     def costs(self) -> dict[str, dict[str, Any]]:
         """Return each preset's milliseconds per frame and the number of measured frames.
 
-        A preset that has run gets the median of its frames. Others get the cost table's value, scaled by the mean ratio
-        of measured to tabulated times. A preset that has not run and is not in the table is left out.
-        Callable from any thread.
+        A preset that has run gets the median of its frames; the base otherwise gets its measured cost. Others get the
+        cost table's value, scaled by the mean ratio of measured to tabulated times. A preset that has not run and
+        is not in the table is left out. Callable from any thread.
         """
-        ran = {name: (statistics.median(ms), len(ms)) for name, ms in list(self._preset_ms.items()) if ms}
+        offer = self._offer  # read once, as measuring sets it
+        ran = {BASE.name: (offer["base"], 0)} if offer else {}
+        ran |= {name: (statistics.median(ms), len(ms)) for name, ms in list(self._preset_ms.items()) if ms}
         ratios = [ran[name][0] / ms for name, ms in self._table.items() if name in ran] or [1.0]
         scaled = {name: (ms * statistics.mean(ratios), 0) for name, ms in self._table.items()}
         return {name: {"ms": round(ms, 2), "frames": count} for name, (ms, count) in (scaled | ran).items()}
@@ -198,7 +201,6 @@ class BudgetSetting:
             return None
         return {
             "settings": dict(controller.settings),
-            "expected_ms": round(controller.expected_ms, 2),
             "expected_error": self._whole_error(controller.expected_error),
             "factor": round(controller.factor, 4),
         }

@@ -471,7 +471,6 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 
     def part(kind: str, index: int, item: Any) -> dict[str, Any]:
         record = {**plain(item), "visible": (kind, index) not in wanted.hidden}
-        record["animated"] = not isinstance(item, Proxy) and item.animate is not None
         if isinstance(item, Object):
             material = _shown_material(item)
             model = next(name for name, made in MATERIALS.items() if isinstance(material, made))
@@ -498,7 +497,6 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
         },
         "effects": {name: name not in wanted.off for name in EFFECTS},
         "quality": wanted.quality.name,
-        "methods": dict(wanted.methods),
     }
 
 

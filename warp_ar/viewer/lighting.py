@@ -72,7 +72,7 @@ class Lighting:
             SceneError: The scene does not fit the source.
         """
         self._controls, self._notify, self._give_up = controls, notify, give_up
-        self.device = str(resolve_device(device))
+        resolve_device(device)
         # A plan is made at once, so that an impossible request fails before anything is shown.
         target = make_target(controls.wanted, controls.feed)
         assert target.size is not None
@@ -231,7 +231,7 @@ class Lighting:
 
     def plan_message(self) -> dict[str, Any]:
         """Return the message of the running stages, and of the omitted stages with the reason for each."""
-        told = {"type": "plan", "plan": self.swaps, "device": self.device, "quality": None, "run": [], "left_out": []}
+        told = {"type": "plan", "plan": self.swaps, "quality": None, "run": [], "left_out": []}
         if self.plan is None:
             return told
         quality = self.plan.request.quality

@@ -25,8 +25,6 @@ from typing import Any, Final
 from warp_ar.errors import WarpArError, reason
 from warp_ar.pictures import picture_size
 
-SCHEMA: Final = 3
-"""Version of the messages, sent in ``hello``; it grows when keys change."""
 MAX_TEXT: Final = 4096
 """Longest text message from a page in bytes: an edit takes under 200."""
 MAX_PICTURE: Final = 1 << 20

@@ -389,11 +389,8 @@ class Server:
         return {
             "type": "hello",
             "run": _RUN,
-            "protocol": protocol.SCHEMA,
             "scenes": list(bundled_scenes()),
             "presets": list(PRESETS),
-            "effects": list(protocol.EFFECTS),
-            "largest_camera": list(protocol.LARGEST_CAMERA),
             "outside": self.address.outside_url,
         }
 

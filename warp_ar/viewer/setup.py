@@ -246,7 +246,7 @@ class SetupChecks:
             return
         focal = fit.ratio * camera.fx
         if self._controls.use_estimate(dataclasses.replace(camera, fx=focal, fy=focal), feed):
-            self._notify({"type": "intrinsics", "focal": focal, "spread": fit.deviation, "views": fit.views})
+            self._notify({"type": "intrinsics", "focal": focal, "spread": fit.deviation})
 
     # ----------------------------------------------------------------------------------------------------------- steps
 
@@ -493,7 +493,6 @@ class CalibrationSession:
                 "focal": report.camera.fx,
                 "error": report.error,
                 "deviation": report.focal_deviation,
-                "coverage": report.coverage,
                 "warnings": list(report.warnings),
             }
         return {

@@ -267,13 +267,17 @@ function showSplit() {
   view.draw();
 }
 
+let began = 0;
 function showBuilding() {
   const { building } = state;
+  if ($("building").hidden) began = performance.now();
   $("building").hidden = !building;
   if (!building) return;
   const count = building.count ? ` (${building.done} of ${building.count})` : "";
   const meanwhile = view.stats.plan ? "" : " The camera's picture is shown meanwhile.";
-  $("building").lastElementChild.textContent = `Compiling kernels for ${building.quality}, once for this kind of scene${count}.${meanwhile}`;
+  const [, words, seconds] = $("building").children;
+  words.textContent = `Compiling kernels for ${building.quality}, once for this kind of scene${count}.${meanwhile}`;
+  seconds.textContent = `${Math.round((performance.now() - began) / 1000)} s`;
 }
 
 function showCamera() {

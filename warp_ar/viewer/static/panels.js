@@ -542,10 +542,10 @@ export class QualityPanel {
     return auto?.factor ?? (costs.medium ? costs.medium.ms / this.#budget.base : 1);
   }
 
-  /** What the slider's budget buys, as the program chooses; null while costs are unknown. */
+  /** What the slider's budget buys, as the program chooses; null while no costs are known. */
   #bought() {
-    const { known, base, choices } = this.#budget ?? {};
-    if (!known) return null;
+    const { base, choices } = this.#budget ?? {};
+    if (!choices) return null;
     const factor = this.#load;
     const took = (choice) => factor * (base + choice.ms);
     const fitting = choices.filter((choice) => took(choice) <= AIM * this.#ms);
@@ -562,7 +562,7 @@ export class QualityPanel {
     const bought = this.#bought();
     this.plot.parentElement.classList.toggle("off", !on);
     this.#plot(bought);
-    document.getElementById("buys").replaceChildren(...(bought && on ? this.#methods(bought.choice) : []));
+    document.getElementById("buys").replaceChildren(...(this.#budget?.known && on ? this.#methods(bought.choice) : []));
     document.getElementById("budget-note").textContent = this.#note(bought);
   }
 
@@ -580,9 +580,9 @@ export class QualityPanel {
     return parts.join(" ");
   }
 
-  /** Error over time, over the slider's own scale: presets, hollow until they ran here, and all that can be bought. */
+  /** Error over time, over the slider's own scale: presets, hollow until they ran here, and what can be bought, as far as it is known. */
   #plot(bought) {
-    const { choices = [], errors = {} } = this.#budget ?? {};
+    const { choices = [], errors = {}, known } = this.#budget ?? {};
     const { costs = {} } = this.#state ?? {};
     const presets = Object.entries(errors).filter(([name]) => costs[name]).map(([name, error]) => ({ name, error, ...costs[name] }));
     const [width, height] = [this.plot.clientWidth, this.plot.clientHeight];
@@ -608,7 +608,7 @@ export class QualityPanel {
       let path = "";
       for (const c of choices) path += path ? `H${x(took(c)).toFixed(1)}V${y(c.error).toFixed(1)}` : `M${x(took(c)).toFixed(1)} ${top}V${y(c.error).toFixed(1)}`;
       parts.push(shape("path", { class: "area", d: `${path}H${width - right}V${height}H${x(took(choices[0])).toFixed(1)}Z` }), shape("path", { class: "line", d: `${path}H${width - right}` }));
-      parts.push(shape("circle", { class: "choice", cx: x(took(choice)), cy: y(choice.error), r: 5 }));
+      if (known) parts.push(shape("circle", { class: "choice", cx: x(took(choice)), cy: y(choice.error), r: 5 }));
     }
     if (this.#on) parts.push(shape("line", { class: "budget", x1: x(this.#ms), x2: x(this.#ms), y1: 4, y2: height }));
     for (const { name, error, ms, frames } of presets) {
