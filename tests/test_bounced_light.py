@@ -11,9 +11,7 @@ from tests.relight_rig import CAMERA, FLOAT_ERROR, POINTS, point
 from tests.twins import receiver_cells as reference
 from warp_ar.kernels.receiver import receiver_cells
 from warp_ar.kernels.receiver.receiver_cells import Patch
-from warp_ar.kernels.structs import (
-    PLANE,
-)
+from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.geometry import rotation_matrix
 
 # --- Bounced light: closed forms --------------------------------------------------------------------------------------

@@ -20,16 +20,7 @@ from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.environment import bracket
 from warp_ar.kernels.structs import make_environment_view
-from warp_ar.scene import (
-    Camera,
-    Marker,
-    MirrorMaterial,
-    Object,
-    Pose,
-    Probe,
-    Proxy,
-    Scene,
-)
+from warp_ar.scene import Camera, Marker, MirrorMaterial, Object, Pose, Probe, Proxy, Scene
 from warp_ar.session import Session
 from warp_ar.sources.exposures import MOST_EXPOSURES, find_exposure, plan_bracket
 from warp_ar.sources.sources import Synthetic

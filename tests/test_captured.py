@@ -11,13 +11,7 @@ from tests.error_model import check_error
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
-from warp_ar.light.captured import (
-    CapturedEmitter,
-    Light,
-    find_emitters,
-    latlong_directions,
-    texel_solid_angles,
-)
+from warp_ar.light.captured import CapturedEmitter, Light, find_emitters, latlong_directions, texel_solid_angles
 from warp_ar.light.latlong_axes import DESCRIPTIONS, to_axes, world_from_marker
 from warp_ar.scene import dumps_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix

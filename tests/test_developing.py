@@ -71,14 +71,3 @@ def test_page_shows_every_example() -> None:
     page = (ROOT / "docs" / "developing.md").read_text(encoding="utf-8")
     assert set(re.findall(r"`docs/examples/([\w-]+)\.diff`", page)) == set(CASES)
     assert {path.stem for path in EXAMPLES.glob("*.diff")} == set(CASES)
-
-
-def test_every_file_of_kernels_can_be_looked_up() -> None:
-    """It is a stage's, by its name, or stands in the page's table."""
-    page = (ROOT / "docs" / "developing.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"`(\w+)\.py`", page)) | {
-        f"environment_shadow{part}" for part in re.findall(r"`(_\w+)\.py`", page)
-    }
-    stages = {path.stem for path in (ROOT / "warp_ar" / "stages").glob("*.py")}
-    files = {path.stem for path in (ROOT / "kernels").rglob("*.py")} - {"__init__"}
-    assert files - stages - named == set()

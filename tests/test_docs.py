@@ -76,10 +76,6 @@ def test_names_of_the_library_exist(page: pathlib.Path) -> None:
         assert pydoc.locate(name) is not None, f"{page.name}: {name}"
 
 
-def test_pages_have_commands() -> None:
-    assert sum(len(commands(page)) for page in PAGES) > 50
-
-
 def test_made_parts_are_those_of_the_code() -> None:
     """``python -m docs.tables --write`` brings them up to date."""
     assert tables.main([]) == 0

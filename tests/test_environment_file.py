@@ -15,12 +15,7 @@ from warp_ar.errors import SinkError, UsageError
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import AXES, DESCRIPTIONS, to_axes
 from warp_ar.output.environment_axes import CUBES, to_cube
-from warp_ar.output.environment_file import (
-    EnvironmentInfo,
-    read_environment,
-    read_environment_info,
-    write_environment,
-)
+from warp_ar.output.environment_file import EnvironmentInfo, read_environment, read_environment_info, write_environment
 from warp_ar.signals import REC_709
 
 FLOAT32 = 1e-6

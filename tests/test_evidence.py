@@ -8,10 +8,7 @@ import pytest
 from tests.recover_rig import DistantLight, lit_environment, scene  # noqa: F401
 from warp_ar.kernels.recovery.recover_cells import LOST
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.evidence import (
-    check_card,
-    covered_card,
-)
+from warp_ar.light.evidence import check_card, covered_card
 from warp_ar.light.recovery import Recovery
 
 pytestmark = pytest.mark.slow

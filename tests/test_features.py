@@ -25,22 +25,6 @@ def plan_of(preset: str = "medium", **changes: object) -> Plan:
     return make_plan(Request(make_scene(**changes), PRESETS[preset], SIZE))
 
 
-def test_a_scene_of_everything_calls_for_everything() -> None:
-    found = features_of()
-    assert found.layers == ("virtual", "added_light", "shadow_ratio", "mirror_ball")
-    assert found.environment
-    assert found.recovered
-    assert found.emitters
-    assert found.near_field
-    assert found.exposed
-    assert found.declipped
-    assert found.declipped_by_ball
-    assert not found.boxed
-    assert found.relight_method == "bounce"
-    assert found.ambient_visibility
-    assert found.bounced
-
-
 def test_without_a_ball_nothing_is_known_of_the_environment() -> None:
     found = features_of(probes=())
     assert not (found.environment)

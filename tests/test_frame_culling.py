@@ -14,54 +14,14 @@ from hypothesis import strategies as st
 
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
 from tests.recover_rig import solve_here
-from warp_ar.engine.frame_culling import FrameCulling
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.light.estimate import Estimate
 from warp_ar.light.recovery import Recovery
 from warp_ar.scene import Exposure, Light, Scene
-from warp_ar.stages.base import Reach, Wiring
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Estimates
 
 pytestmark = pytest.mark.slow
-
-# --- The walk ---------------------------------------------------------------------------------------------------------
-
-
-class Step:
-    """What ``FrameCulling`` asks of a stage."""
-
-    follows = False
-
-    def __init__(self, name: str, reads: str, writes: str, needs: str = "", *, follows: bool = False) -> None:
-        self.name, self.needs, self.follows = name, needs, follows
-        self.wiring = Wiring(tuple(reads.split()), tuple(writes.split()))
-
-    def reads_for(self, reach: Reach) -> tuple[str, ...]:
-        return tuple(name for name in self.wiring.reads if reach.falls or name != "response")
-
-    def idle(self, reach: Reach) -> str | None:
-        return None if not self.needs or getattr(reach, self.needs) else f"no {self.needs}"
-
-
-STEPS = (
-    Step("see", "frame", "seen", follows=True),
-    Step("keep", "seen", "environment"),
-    Step("filter", "environment", "filtered"),
-    Step("shade", "filtered", "virtual", "objects"),
-    Step("relight", "environment", "added", "light"),
-    Step("compose", "virtual added", "image"),
-)
-DARK, EMPTY, NOTHING = Reach(light=False), Reach(objects=False), Reach(objects=False, light=False)
-
-
-def test_an_idle_stage_clears_once_and_rests_with_what_only_it_reads() -> None:
-    culling = FrameCulling(STEPS, ("image",))  # type: ignore[arg-type]
-    assert culling.look(EMPTY) == ({}, {"shade"}), "what it wrote before must go"
-    nobody = "nothing reads its filtered in this frame"
-    assert culling.look(EMPTY) == ({"shade": "no objects", "filter": nobody}, set())
-    assert culling.look(Reach()) == ({}, set())
-    assert culling.look(EMPTY)[1] == {"shade"}, "it has written since"
 
 
 # --- Pictures ---------------------------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import tomllib
 
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from warp_ar.scene import loads_scene
 from warp_ar.scene.description import SCHEMA
 from warp_ar.scene.fields import Field, fields_of
-from warp_ar.scene.key_tables import SECTIONS, Key, as_markdown, keys
+from warp_ar.scene.key_tables import SECTIONS, Key, keys
 from warp_ar.scene.materials import MATERIALS
 from warp_ar.scene.scene_files import SceneFiles
 from warp_ar.scene.sections import SceneTable, read_value
@@ -74,9 +73,3 @@ def test_reference_has_all_fields():
         for field in dataclasses.fields(kind)
     }
     assert fields - {(key.section, key.name) for key in KEYS} == {("object", "mesh")}
-
-
-def test_page_has_a_row_for_every_key():
-    page = as_markdown()
-    assert len(re.findall(r"^- `", page, flags=re.M)) == len(KEYS)
-    assert all(key.meaning and key.unit and key.default for key in KEYS)

@@ -11,7 +11,6 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from bench.paper_figures import GAP, sheet
 from tests.accuracy_rig import case, frames, report, setting  # noqa: F401  (fixtures)
 from warp_ar.accuracy import cases, charts, measure
 from warp_ar.accuracy import report as report_module
@@ -203,24 +202,6 @@ def test_changed_region_takes_what_changed_and_no_noise():
     assert region[20:40, 30:50].all()
     assert not region[:5].any()
     assert not changed_region(camera, camera ^ 1).any()
-
-
-# --- Crops, and sheets of them ----------------------------------------------------------------------------------------
-
-
-def test_a_sheet_holds_every_column_and_its_error():
-    pytest.importorskip("flip_evaluator")
-    box = slice(0, 60), slice(0, 360)
-    black, white = np.zeros((60, 360, 3), np.uint8), np.full((60, 360, 3), 255, np.uint8)
-    plain = sheet([black, white], None, box)
-    assert plain.shape == (60, 2 * 360 + GAP, 3)
-    assert (plain[:, :360] == 0).all()
-    assert (plain[:, 360:] == 255).all()
-    with_errors = sheet([black, white], black, box)
-    assert with_errors.shape == (2 * 60 + GAP, 2 * 360 + GAP, 3)
-    below = with_errors[60 + GAP :]
-    assert below[30, 100].max() < 10  # no error
-    assert below[30, 360 + GAP + 100].max() > 200
 
 
 # --- Charts: all points inside, all named, in the page's colours ------------------------------------------------------

@@ -43,11 +43,7 @@ from tests.twins import color as reference_color
 from tests.twins import mirror_ball as reference
 from tests.twins import relight as reference_relight
 from tests.twins.visibility import Body
-from warp_ar.kernels.structs import (
-    BOX,
-    PLANE,
-    SPHERE,
-)
+from warp_ar.kernels.structs import BOX, PLANE, SPHERE
 from warp_ar.stages.mirror_ball import SIDES
 
 # --- closed forms

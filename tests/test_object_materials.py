@@ -20,15 +20,7 @@ from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, RayScene
-from warp_ar.scene import (
-    Camera,
-    LambertMaterial,
-    Object,
-    PhongMaterial,
-    Scene,
-    dumps_scene,
-    object_from_trimesh,
-)
+from warp_ar.scene import Camera, LambertMaterial, Object, PhongMaterial, Scene, dumps_scene, object_from_trimesh
 from warp_ar.scene.mesh_files import load_mesh, mesh_from_trimesh
 from warp_ar.scene.ray_scene import HostScene
 

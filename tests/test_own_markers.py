@@ -12,18 +12,7 @@ import warp as wp
 from tests.test_tracking import CAMERA, look, render
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
-from warp_ar.scene import (
-    GridBoard,
-    Light,
-    Marker,
-    Object,
-    Pose,
-    Probe,
-    Proxy,
-    Scene,
-    dumps_scene,
-    loads_scene,
-)
+from warp_ar.scene import GridBoard, Light, Marker, Object, Pose, Probe, Proxy, Scene, dumps_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.stages.quality import PRESETS

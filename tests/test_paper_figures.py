@@ -29,18 +29,6 @@ def test_readings_can_be_run():
         assert not taken[0].video
 
 
-def test_the_plane_is_where_the_marker_says():
-    """The card's centre is the world's origin: some pixel of the printed marker sees (0, 0)."""
-    case = Context("cpu", 1, 4).case("wire_coincident")
-    points, inside = paper_figures._plane_points(case, 0)
-    distance = np.hypot(points[..., 0], points[..., 1])
-    row, column = np.unravel_index(distance.argmin(), distance.shape)
-    assert inside[row, column]
-    assert distance.min() < 0.005
-    marker = case.frames[0].image[row - 3 : row + 4, column - 3 : column + 4]
-    assert int(marker.max()) - int(marker.min()) > 60  # black and white cells
-
-
 @pytest.mark.parametrize("number", [5, 6, 8])
 def test_figures_of_the_wire(number, device, monkeypatch):
     monkeypatch.setattr(paper_figures, "OURS", ("low",))

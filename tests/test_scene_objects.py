@@ -13,15 +13,7 @@ import trimesh
 from tests.test_pipeline import SPARED, Frames, frames, make_scene, run
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.scene import (
-    AreaLight,
-    LambertMaterial,
-    MirrorMaterial,
-    Object,
-    Scene,
-    dumps_scene,
-    loads_scene,
-)
+from warp_ar.scene import AreaLight, LambertMaterial, MirrorMaterial, Object, Scene, dumps_scene, loads_scene
 from warp_ar.scene.geometry import make_mesh
 from warp_ar.stages.quality import PRESETS
 

@@ -23,27 +23,6 @@ def load(name: str) -> dict:
     return tomllib.loads((SCENES / f"{name}.toml").read_text())
 
 
-@pytest.mark.parametrize("script", sorted(path.name for path in SCENES.glob("make_*.py")))
-def test_a_script_with_options_runs(script: str) -> None:
-    """What asks for options is a command, and a command that never calls its ``main`` ends in silence."""
-    text = (SCENES / script).read_text()
-    assert ("ArgumentParser(" in text) == text.endswith('\nif __name__ == "__main__":\n    main()\n')
-
-
-def test_the_scenes_are_these() -> None:
-    assert sorted(path.stem for path in SCENES.glob("*.toml")) == sorted(NAMES)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_file_exists(name: str) -> None:
-    scene = load(name)
-    assert scene["name"] == name
-    items = [*scene.get("object", []), *scene.get("light", [])]
-    files = [scene["source"]["path"], *(item[key] for item in items for key in ("file", "image") if key in item)]
-    for file in files:
-        assert (SCENES / file).is_file(), file
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_the_ball_stands_on_the_table_proxy(name: str) -> None:
     scene = load(name)

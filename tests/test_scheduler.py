@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.engine import graph, modules
+from warp_ar.engine import graph
 from warp_ar.engine.graph import Plan, make_plan
-from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.scheduler import Scheduler
 from warp_ar.kernels.launch import copy, launch, launch_rows
-from warp_ar.scene import load_scene
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.quality import PRESETS
@@ -235,21 +233,6 @@ def test_rows_that_are_not_due_are_left_alone(monkeypatch: pytest.MonkeyPatch) -
             expected[slice(*rows[0])] = 1
             np.testing.assert_array_equal(arrays["a"].numpy(), expected)
         scheduler.close()
-
-
-@pytest.mark.slow
-def test_progress_counts_what_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """First 0 of all, in the end all; a second scheduler of the kind finds everything and says nothing."""
-    known: set[Any] = set()
-    # Each is missing once, whatever the cache holds.
-    monkeypatch.setattr(modules, "_is_cached", lambda one: one in known or bool(known.add(one)))
-    heard: list[list[tuple[int, int]]] = []
-    for _ in range(2):
-        heard.append([])
-        with Pipeline(load_scene("mirror"), device="cpu", quality="paper", bands=2) as pipeline:
-            pipeline.warm_up(lambda done, total: heard[-1].append((done, total)))
-    assert len(heard[0]) > 5
-    assert heard == [[(done, len(heard[0]) - 1) for done in range(len(heard[0]))], []]
 
 
 def test_stages_without_a_common_input_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:

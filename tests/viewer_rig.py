@@ -26,7 +26,7 @@ from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.viewer.address import Address
 from warp_ar.viewer.gate import HEADER_SECONDS
 from warp_ar.viewer.host import Host, Lit
-from warp_ar.viewer.protocol import ProtocolError, parse_text
+from warp_ar.viewer.protocol import parse_text
 from warp_ar.viewer.server import Server, encode_jpeg
 
 SIZE = (320, 240)
@@ -259,11 +259,3 @@ def run(test: Any) -> Any:
         asyncio.run(asyncio.wait_for(test(*arguments, **keywords), 4 * PATIENCE))
 
     return wrapper
-
-
-def is_refused(message: str | bytes) -> bool:
-    """Whether a message closes the page that sends it."""
-    try:
-        return isinstance(message, str) and parse_text(message) is None
-    except ProtocolError:
-        return True
