@@ -88,7 +88,7 @@ def test_what_is_new_stands_apart_and_on_the_desk() -> None:
     ],
 )
 def test_no_edit_names_a_file_or_what_is_no_key(part: str, key: str, value: Any) -> None:
-    with pytest.raises(UsageError):
+    with pytest.raises((UsageError, SceneError)):
         edits.set_value(page_scene(), part, 0, key, value)
     with pytest.raises(UsageError):
         edits.set_value(page_scene(), "light", 5, "at", (0.0, 0.0, 0.0))

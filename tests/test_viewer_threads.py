@@ -123,7 +123,7 @@ def test_an_estimate_that_comes_late_is_not_the_next_source_s() -> None:
     camera = BrowserCamera(controls, lambda message: None)
     camera.use(*SIZE, "me")
     controls.adopt()
-    feed, found = controls.feed, guessed_camera(*SIZE, focal=1234.0)
+    feed, found = controls.feed, dataclasses.replace(guessed_camera(*SIZE), fx=1234.0, fy=1234.0)
     assert controls.use_estimate(found, feed)
     assert controls.feed.camera is found
     assert controls.feed.estimated

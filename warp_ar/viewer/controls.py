@@ -9,7 +9,6 @@ from __future__ import annotations
 import collections
 import dataclasses
 import itertools
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -354,17 +353,9 @@ DEFAULT_FIELD_OF_VIEW: Final = 60.0
 """Horizontal field of view, degrees: between those of phones' main cameras (65 to 70) and of laptops (50 to 60)."""
 
 
-def guessed_camera(width: int, height: int, transfer: Any = "srgb", focal: float | None = None) -> Camera:
-    """Return a camera with square pixels, a central principal point and no distortion.
-
-    Args:
-        width: Columns of its frames.
-        height: Rows of its frames.
-        transfer: Transfer function, as in a scene file.
-        focal: Focal length, pixels; None means that of the default field of view.
-    """
-    focal = focal or 0.5 * width / math.tan(0.5 * math.radians(DEFAULT_FIELD_OF_VIEW))
-    return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), transfer=transfer)
+def guessed_camera(width: int, height: int) -> Camera:
+    """Return a camera for frames of a size, of the default field of view, by its numbers."""
+    return dataclasses.replace(Camera.guessed(width, height, DEFAULT_FIELD_OF_VIEW), field_of_view=None)
 
 
 _LEAD_MS: Final = 40.0

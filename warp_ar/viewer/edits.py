@@ -278,9 +278,6 @@ def _material(material: Material, key: str, value: Any) -> Material:
         return cast(Material, made(color))
     if key not in vars(material):
         raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(vars(material))}")
-    color_like = isinstance(vars(material)[key], tuple | Path)
-    if color_like != isinstance(value, tuple):
-        raise UsageError(f"material: {key} takes {'a colour' if color_like else 'a number'}")
     return dataclasses.replace(material, **{key: value})
 
 
