@@ -86,6 +86,7 @@ def test_another_object_of_a_kind_that_is_there_compiles_nothing(frames: Frames)
 def test_poses_come_back() -> None:
     with Pipeline(named(), device="cpu", quality="low") as pipeline:
         lamp = pipeline.objects["lamp"]
+        assert f"{pipeline.objects} {lamp}" == "SceneObjects({'lamp': 'sphere', 1: 'torus'}) SceneObject('lamp')"
         lamp.world_from_object = 2.0 * UPRIGHT + np.diag([0.0, 0.0, 0.0, -1.0])
         np.testing.assert_allclose(lamp.world_from_object[:3], 2.0 * UPRIGHT[:3], atol=1e-6)
         half = np.sqrt(0.5)

@@ -26,6 +26,11 @@ class SceneObjects:
         """Take a function that returns the objects and one that edits them."""
         self._objects, self._edit = objects, edit
 
+    def __repr__(self) -> str:
+        """Return the key and shape of every object."""
+        shapes = {item.name or index: item.shape for index, item in enumerate(self._objects())}
+        return f"SceneObjects({shapes})"
+
     def __len__(self) -> int:
         """Return the number of objects."""
         return len(self._objects())
@@ -83,6 +88,10 @@ class SceneObject:
     def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None], key: str | int) -> None:
         """Take functions that return and edit the objects, and the key of this one."""
         self._objects, self._edit, self._key = objects, edit, key
+
+    def __repr__(self) -> str:
+        """Return the key; the object itself may have been removed."""
+        return f"SceneObject({self._key!r})"
 
     @property
     def value(self) -> Object:

@@ -114,7 +114,7 @@ def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error
     if picture.header.get("software") == PROGRAM:
         return "z-up"
     taken, whose = ("blender", "as Blender reads .hdr") if path.suffix.lower() == ".hdr" else ("y-up", "OpenEXR's own")
-    say_once(f"{label} does not state its axes: {taken} is assumed, {whose}; else give --light-axes or [light] axes")
+    say_once(f"{label} does not state its axes: {taken} is assumed, {whose}; else give axes (--light-axes, [light])")
     return taken
 
 
