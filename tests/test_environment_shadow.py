@@ -131,7 +131,7 @@ def test_the_physical_among_samples_matches_the_reference(device, bounce):
     assert np.abs(got - expected).max() < SET_ERROR
 
 
-@pytest.mark.parametrize("bounce", ["estimated", "traced"])
+@pytest.mark.parametrize("bounce", ["estimated", pytest.param("traced", marks=pytest.mark.slow)])
 def test_what_the_ball_hides_is_not_there(device, bounce):
     """Seen from the desk in front of the ball, an object behind it neither takes light nor sends any."""
     ball = np.array([0.0, 0.0, 0.035])

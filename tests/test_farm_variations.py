@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from tests.farm_rig import make_jobs
+from tests.kernel_rig import look_at
 from warp_ar.farm.dataset import NoPlace, _overlap, draw_variation, local_points, receiver_of
-from warp_ar.scene import Pose, load_scene
+from warp_ar.scene import load_scene
 from warp_ar.scene.geometry import rotation_matrix
 
 OBJECTS = [
@@ -25,17 +26,7 @@ ROUNDED = 2e-6
 """Metres by which a hull of single-precision points, and a place rounded to a micrometre, may be off."""
 
 
-def looking_down(x: float, y: float, height: float = 0.6) -> Pose:
-    """A camera above (x, y) that looks at the origin."""
-    place = np.array([x, y, height])
-    forward = -place / np.linalg.norm(place)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Pose(rotation, -rotation @ place)
-
-
-POSES = [looking_down(0.5 * np.cos(a), 0.5 * np.sin(a)) for a in np.linspace(-2.2, -0.9, 5)]
+POSES = [look_at((0.5 * np.cos(a), 0.5 * np.sin(a), 0.6)) for a in np.linspace(-2.2, -0.9, 5)]
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +100,7 @@ def test_no_object_hides_the_marker_from_any_camera(drawn):
 
 def test_what_would_hide_the_marker_finds_no_place(tmp_path):
     """A tall box stands before the marker, as the camera sees it, or behind it: only behind it is allowed."""
-    low = looking_down(0.0, -0.5, 0.15)
+    low = look_at((0.0, -0.5, 0.15))
     for y0, y1, found in ((-0.2, -0.16, False), (0.28, 0.32, True)):
         section = {"objects": [1, 1], "object": [{"shape": "box", "size": [0.02, 0.02, 0.2]}]}
         dataset = make_jobs(tmp_path, [{"scene": "desk"}], dataset={**section, "region": [-0.01, y0, 0.01, y1]}).dataset

@@ -430,6 +430,7 @@ def test_boards_of_the_old_layout_are_found(columns, rows):
     assert loads_scene(text.format(board)).marker.board == board
 
 
+@pytest.mark.slow
 def test_a_fisheye_is_calibrated(tmp_path):
     """Pictures of a lens of 140 degrees across its corners: focal length, and where the rim's pixels look."""
     width, height, focal, terms = 640, 480, 340.0, np.array([-0.03, 0.01, -0.004, 0.0])

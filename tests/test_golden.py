@@ -30,6 +30,8 @@ CASES = {
     **{f"{name}_high": (name, PRESETS["high"]) for name in ("desk", "torus", "mirror")},
 }
 """Scene and quality of every golden frame."""
+SLOW = {"screen", "product", "desk_bounce", "screen_paper", "product_paper", "torus_high", "mirror_high"}
+"""Frames whose long kernels no other test needs."""
 
 # Codes. Video decoders may differ by a code or two, CPU and CUDA by rounding; both are spread over all pixels.
 MEAN_TOLERANCE = 0.5
@@ -57,7 +59,7 @@ def test_every_bundled_scene_has_a_test() -> None:
     assert set(SCENES) == set(bundled_scenes())
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
 def test_golden(name: str, device: str, request: pytest.FixtureRequest) -> None:
     image = render(*CASES[name], device)
     path = GOLDEN / f"{name}.png"

@@ -209,6 +209,7 @@ def shown_by_a_mirror(offset):
 PLACES = (np.arange(10) + 0.5) / 10 - 0.5
 
 
+@pytest.mark.slow
 def test_mirror_is_the_mean_over_its_pixel(device):
     """A hundred places of each pixel, the ball's own only: near its rim neighbouring pixels have nothing in common."""
     with np.errstate(invalid="ignore"), warnings.catch_warnings():

@@ -29,6 +29,7 @@ def test_readings_can_be_run():
         assert not taken[0].video
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [5, 6, 8])
 def test_figures_of_the_wire(number, device, monkeypatch):
     monkeypatch.setattr(paper_figures, "OURS", ("low",))

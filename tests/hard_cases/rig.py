@@ -165,8 +165,8 @@ COMBINATIONS: dict[str, Request] = {
     **{f"further {number}": _combination("medium", **some) for number, some in enumerate(_further_methods())},
 }
 """Requests that between them hold every stage on every method, so that few pipelines are compiled."""
-SLOW = ("reference",)
-"""Those that a plain run leaves out."""
+SLOW = ("reference", "further 0")
+"""Those of methods that only `reference` names, or no preset: a plain run leaves them out."""
 
 
 def plan_names(plan: Plan) -> tuple[str, ...]:
@@ -210,9 +210,10 @@ def _marks(stage: str, method: str) -> list[pytest.MarkDecorator]:
     return [pytest.mark.slow] if combination_of(stage, method) in SLOW else []
 
 
-def cases(*stages: str) -> list[Any]:
+def cases(*stages: str, without: str = "") -> list[Any]:
     """Parameters ``stage`` and ``method`` of some stages, those of slow combinations marked so."""
-    return [pytest.param(stage, method, marks=_marks(stage, method)) for stage in stages for method in METHODS[stage]]
+    pairs = [(stage, method) for stage in stages for method in METHODS[stage] if method != without]
+    return [pytest.param(*pair, marks=_marks(*pair)) for pair in pairs]
 
 
 def methods(stage: str) -> list[Any]:

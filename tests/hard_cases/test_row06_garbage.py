@@ -12,11 +12,11 @@ from tests.hard_cases import atlas, generators
 from tests.hard_cases.rig import (
     ENVIRONMENT_HEIGHT,
     EXACT,
-    FILTERS,
     METHODS,
     SIZE,
     STAGE_METHODS,
     assert_finite,
+    cases,
     numbers,
 )
 from warp_ar.kernels.environment.unwrap import RIM_START
@@ -175,7 +175,7 @@ def test_a_broken_texel_is_completed_from_its_neighbours(rig_for, bad):
 
 
 @pytest.mark.atlas(row=6)
-@pytest.mark.parametrize(("stage", "method"), FILTERS)
+@pytest.mark.parametrize(("stage", "method"), cases("irradiance", "prefilter", without="sphere_mip"))
 def test_a_broken_texel_counts_as_no_light(rig_for, stage, method):
     """NaN and negative texels act as black ones, to the bit: no neighbour is poisoned."""
     rig = rig_for(stage, method)
@@ -191,9 +191,7 @@ def test_a_broken_texel_counts_as_no_light(rig_for, stage, method):
 
 
 @pytest.mark.atlas(row=6)
-@pytest.mark.parametrize(
-    ("stage", "method"), [("composite", "default"), *(("expose", method) for method in METHODS["expose"])]
-)
+@pytest.mark.parametrize(("stage", "method"), cases("composite", "expose"))
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -1.0, 3e38])
 def test_a_broken_layer_pixel_stays_one_pixel(rig_for, stage, method, bad):
     rig = rig_for(stage, method)

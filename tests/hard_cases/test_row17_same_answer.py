@@ -16,7 +16,7 @@ REMEMBERS = ("recover",)
 
 
 @pytest.mark.atlas(row=17)
-@pytest.mark.parametrize(("stage", "method"), [case for case in STAGE_METHODS if case[0] in REMEMBERS])
+@pytest.mark.parametrize(("stage", "method"), cases(*REMEMBERS))
 def test_from_the_first_frame_on(device, stage, method):
     """A whole sequence again, from the start and in other bands."""
     found = []

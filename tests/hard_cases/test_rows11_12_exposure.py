@@ -15,7 +15,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import METHODS, SIZE
+from tests.hard_cases.rig import METHODS, SIZE, cases, methods
 from warp_ar.kernels import color
 from warp_ar.kernels.picture import composite, expose, summed_area
 from warp_ar.kernels.structs import FrameParams, make_picture
@@ -135,7 +135,7 @@ def untouched_by(rig):
 @pytest.mark.atlas(row=12)
 @pytest.mark.parametrize(
     ("stage", "method"),
-    [("summed_area", "default"), ("composite", "default"), *(("expose", method) for method in METHODS["expose"])],
+    cases("summed_area", "composite", "expose"),
 )
 @pytest.mark.parametrize("name", ["black", "white", "one saturated pixel"])
 def test_frames_at_their_ends_in_the_pipeline(rig_for, stage, method, name):
@@ -156,7 +156,7 @@ def test_frames_at_their_ends_in_the_pipeline(rig_for, stage, method, name):
 
 
 @pytest.mark.atlas(row=11, stage="expose")
-@pytest.mark.parametrize("method", METHODS["expose"])
+@pytest.mark.parametrize("method", methods("expose"))
 def test_no_box_beyond_the_frame_darkens_its_border(rig_for, method):
     """On a white frame every pixel, in corners too, is at least as bright as scaling alone makes it."""
     rig = rig_for("expose", method)
