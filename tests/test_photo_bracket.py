@@ -74,10 +74,26 @@ def test_lying_exposures_are_refused_with_all_three_figures():
     assert "--exposures" in message
 
 
-def test_equal_pictures_contradict_unequal_exposures_under_every_response():
-    images = patches((15, 60, 60, 250))
-    with pytest.raises(UsageError, match=r"no response explains"):
-        agree_exposures(images, "srgb", [1.0, 0.25, 0.0625, 0.015], None)
+def test_two_wrong_times_contradict_the_pictures_under_every_response():
+    with pytest.raises(UsageError, match=r"no response explains them \(b to c is off by"):
+        agree_exposures(patches(BRACKET), "srgb", [1.0, 0.1, 0.06, 0.045], None, labels="abcd")
+
+
+def test_a_missing_photograph_is_named_and_the_pixels_believed():
+    """At the end it looks like a wrong time of the last; in between, all after it are wrong."""
+    agreed = agree_exposures(patches((15, 60, 1000)), "srgb", TRUE[:3], None, labels="abc")
+    assert agreed.ratios == pytest.approx([1.0, 0.25, 0.015], rel=0.1)
+    assert agreed.curve is None
+    assert agreed.notes[0].startswith("c: EXIF gives it 3.9")
+    agreed = agree_exposures(patches((15, 60, 500, 1000)), "srgb", [1.0, 0.25, 1 / 8, 1 / 16], None, labels="abcd")
+    assert agreed.ratios == pytest.approx([1.0, 0.25, 0.03, 0.015], rel=0.1)
+    assert agreed.notes[0].startswith("is a photograph missing between b and c? EXIF gives the second")
+
+
+def test_a_response_that_one_step_needs_is_doubted():
+    agreed = agree_exposures(patches((15, 60)), "srgb", [1.0, 0.16], None, labels="ab")
+    assert agreed.curve is not None
+    assert agreed.notes[1].startswith("only the step from a to b needs this response; if a time is wrong instead, srgb")
 
 
 def s_curve(light):

@@ -12,8 +12,10 @@ h_j over the codes, by robust least squares on
 
     ln g(u) - ln g(v) = ln(t_u / t_v)
 
-over pixel pairs (u, v) [DM97]. A curve can absorb any single ratio, but not contradictions, because equal codes mean
-equal radiance under every response. The remaining error of each step shows if the exposures are right.
+over the median codes (u, v) of each level of brightness in two neighbouring pictures [DM97]. One curve absorbs a single
+ratio, but not contradictions: it must explain all levels of all pairs. So the fit is repeated with the time of one
+picture unknown, or the times of all pictures after a step, as if a photograph were missing. If the error then vanishes,
+that time is wrong. Of three pictures, any one explains the contradiction.
 
 References:
     [DM97] P. Debevec and J. Malik. Recovering high dynamic range radiance maps from photographs. SIGGRAPH 1997.
@@ -54,6 +56,10 @@ HOLDS = 0.12
 """Largest difference, as a logarithm, between an exposure step and the pixels' ratio."""
 CONTRADICTS = 0.3
 """Largest such difference if a response is estimated with it; above it, no response explains the exposures."""
+UNEVEN = 0.05
+"""Mean error of a response, as a logarithm, above which a time may be wrong: true times leave 0.02, at most 0.08."""
+EXPLAINS = 0.4
+"""Largest error that a wrong time leaves, relative to the error without it."""
 FAR = 40.0
 """Ratio of exposures above which two pictures share no usable pixels."""
 FEATURELESS = 6.0
@@ -259,18 +265,6 @@ def _change(first: Image, other: Image) -> float:
     return 1.4826 * float(np.median(np.abs(ratio - middle[level])))
 
 
-@dataclasses.dataclass(frozen=True)
-class Ratios:
-    """Ratios of neighbouring exposures, measured by pixels."""
-
-    pairs: tuple[tuple[Array, Array], ...]
-    """Codes (m, 3) well exposed in both pictures of each neighbouring pair."""
-    curve: Array
-    """Linear value of each code, (256, 3)."""
-    steps: tuple[float, ...]
-    """Ratio of each picture's exposure to the one before, by the pixels; NaN if too few are well exposed."""
-
-
 def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
     disc = _disc(len(patches[0]))
     smooth = [cv2.GaussianBlur(patch, (0, 0), 1.5) for patch in patches]
@@ -292,62 +286,82 @@ def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
     return tuple(pairs)
 
 
-def _steps(pairs: Sequence[tuple[Array, Array]], curve: Array) -> tuple[float, ...]:
-    steps = []
-    for u, v in pairs:
-        if len(u) < LEAST_PIXELS:
-            steps.append(math.nan)
-            continue
-        low, high = (np.stack([np.interp(c[:, i], np.arange(256), curve[:, i]) for i in range(3)], 1) for c in (u, v))
-        ratio = np.log(high.sum(1) / low.sum(1))
-        # Every brightness level has the same weight, independent of its number of pixels.
-        bins = (u.mean(1) / 16).astype(int)
-        medians = [np.median(ratio[bins == k]) for k in range(16) if (bins == k).sum() >= LEAST_PIXELS // 16]
-        steps.append(float(np.exp(np.median(medians))))
-    return tuple(steps)
+def _levels(patches: Sequence[Image]) -> Array:
+    """Return pairs, and both median codes, (m, 3), of each level of brightness in neighbouring pictures.
+
+    Every level counts once, independent of its number of pixels.
+    """
+    rows = []
+    for k, (u, v) in enumerate(_collect(patches)):
+        level = (u.mean(1) / 8).astype(int)
+        count = np.bincount(level) * (len(u) >= LEAST_PIXELS)
+        for at in np.flatnonzero(count >= LEAST_PIXELS // 16):
+            rows.append((k, np.median(u[level == at].mean(1)), np.median(v[level == at].mean(1))))
+    return np.array(rows).reshape(-1, 3)
 
 
-def measure_ratios(patches: Sequence[Image], curve: Array) -> Ratios:
-    """Measure ratios of neighbouring exposures under a response, in aligned pictures."""
-    pairs = _collect(patches)
-    return Ratios(pairs, curve, _steps(pairs, curve))
+def _at(table: Array, codes: Array) -> Array:
+    """Return columns of a table (256, n) at codes (m,), interpolated: (m, n)."""
+    return np.stack([np.interp(codes, np.arange(256), column) for column in table.T], 1)
 
 
-def estimate_response(ratios: Ratios, steps: Sequence[float]) -> Ratios:
-    """Estimate the response that fits given exposure steps best, and return the pixels' ratios under it.
+def _steps(levels: Array, curve: Array, count: int) -> tuple[float, ...]:
+    """Return the ratio of each picture's exposure to the one before; NaN if too few pixels are well exposed."""
+    pair, low, high = levels[:, 0], *(_at(curve, levels[:, k]).sum(1) for k in (1, 2))
+    told = [np.log(high / low)[pair == k] for k in range(count)]
+    return tuple(float(np.exp(np.median(ratio))) if len(ratio) else math.nan for ratio in told)
+
+
+def _fit(levels: Array, steps: Array, shift: Array) -> tuple[Array, float, float]:
+    """Fit a response to exposure steps, of which some change by an unknown amount.
 
     All channels share one curve: cameras apply the same curve to them, and white balance does not change ratios.
+
+    Args:
+        levels: Median codes (``_levels``).
+        steps: Claimed ratio of each picture's exposure to the one before.
+        shift: By how much the logarithm of each picture's exposure changes, per unit of the unknown.
+
+    Returns:
+        The curve, (256, 3), the unknown, and the mean error of a level's ratio, as a logarithm.
     """
-    knots = np.linspace(0.0, 1.0, HATS + 1)
-    codes = np.sqrt(np.arange(256) / 255.0)
-    hats = np.stack([np.interp(codes, knots, np.eye(HATS + 1)[j]) for j in range(HATS)], 1)
-    base = np.log(np.maximum(decode_table("srgb")[:, 1].astype(float), 1e-5))
-    rows, wanted, share = [], [], []
-    for (u, v), step in zip(ratios.pairs, steps, strict=True):
-        if len(u) < LEAST_PIXELS:
-            continue
-        u, v = u.mean(1), v.mean(1)
-        at_u, at_v = (np.stack([np.interp(c, np.arange(256), hats[:, j]) for j in range(HATS)], 1) for c in (u, v))
-        rows.append(at_v - at_u)
-        wanted.append(math.log(step) - (np.interp(v, np.arange(256), base) - np.interp(u, np.arange(256), base)))
-        # Every brightness level has the same weight, independent of its number of pixels.
-        bins = (u / 16).astype(int)
-        share.append(1.0 / np.bincount(bins, minlength=16)[bins])
-    if not rows:
-        return ratios
-    a, b, w = np.concatenate(rows), np.concatenate(wanted), np.concatenate(share)
-    bend = np.diff(np.eye(HATS + 1), 2, axis=0)[:, :HATS]
-    prior = 0.3 * bend.T @ bend + 1e-3 * np.eye(HATS)
-    weight, values = w, np.zeros(HATS)
+    codes, knots = np.sqrt(np.arange(256) / 255.0), np.linspace(0.0, 1.0, HATS + 1)
+    hats = np.stack([np.interp(codes, knots, hat) for hat in np.eye(HATS + 1)[:HATS]], 1)
+    pair, table = levels[:, 0].astype(int), np.column_stack([hats, _LOG_SRGB])
+    grown = _at(table, levels[:, 2]) - _at(table, levels[:, 1])
+    design = np.column_stack([grown[:, :HATS], -np.diff(shift)[pair]])
+    wanted = np.log(steps)[pair] - grown[:, HATS]
+    bend = np.diff(np.eye(HATS + 1), 2, axis=0)
+    bend[:, HATS] = 0.0
+    prior = 0.3 * bend.T @ bend + np.diag([*[1e-3] * HATS, 1e-9])
+    weight, values = np.ones(len(levels)), np.zeros(HATS + 1)
     for _ in range(12):
-        values = np.linalg.solve(a.T @ (weight[:, None] * a) + prior, a.T @ (weight * b))
-        error = a @ values - b
-        weight = w / (1.0 + (error / 0.15) ** 2)
-    table = np.exp(base + hats @ values)
-    table[0] = 0.0
-    table = np.maximum.accumulate(table)
-    curve = np.repeat((table / table[-1])[:, None], 3, 1)
-    return Ratios(ratios.pairs, curve, _steps(ratios.pairs, curve))
+        values = np.linalg.solve(design.T @ (weight[:, None] * design) + prior, design.T @ (weight * wanted))
+        error = design @ values - wanted
+        weight = 1.0 / (1.0 + (error / 0.15) ** 2)
+    curve = np.maximum.accumulate(np.exp(_LOG_SRGB + hats @ values[:HATS]) * (codes > 0.0))
+    return np.repeat(curve[:, None] / curve[-1], 3, 1), float(values[HATS]), float(np.abs(error).mean())
+
+
+def _corrections(levels: Array, steps: Array) -> list[Array]:
+    """Return corrections to the logarithms of the pictures' exposures, the best first.
+
+    Each corrects one picture or all after a step, and makes the response of a camera explain all levels; empty if none
+    does, or if no correction is needed.
+    """
+    count = len(steps) + 1
+    ways = [*np.eye(count), *(1.0 * (np.arange(count) >= k) for k in range(2, count - 1))]
+    _, _, whole = _fit(levels, steps, np.zeros(count))
+    fits = [(*_fit(levels, steps, way), way) for way in ways]
+    fits = sorted((fit for fit in fits if GAMMAS[0] <= _gamma(fit[0]) <= GAMMAS[1]), key=lambda fit: fit[2])
+    if not fits or whole < UNEVEN or fits[0][2] > EXPLAINS * whole or abs(fits[0][1]) < CONTRADICTS:
+        return []
+    return [change * way for _, change, error, way in fits if error < 2.0 * fits[0][2]]
+
+
+def _gamma(curve: Array) -> float:
+    """Return a response's gamma in the darks, at code 40."""
+    return math.log(max(curve[40, 1], 1e-9)) / math.log(40 / 255)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -362,24 +376,20 @@ class Exposures:
     """Notes for users, one line each."""
 
 
-def _off(claimed: Sequence[float], seen: Sequence[float]) -> float:
+def _off(claimed: Sequence[float] | Array, seen: Sequence[float]) -> float:
     """Return the largest logarithm of the ratio between claimed and measured steps."""
     return max((abs(math.log(c / s)) for c, s in zip(claimed, seen, strict=True) if math.isfinite(s)), default=0.0)
 
 
-def _wrong_one(claim: Sequence[float], seen: Sequence[float]) -> tuple[int, float] | None:
-    """Return the index of the only picture with a wrong claim, and its error.
-
-    None unless the pixels confirm all others.
-    """
-    off = [math.log(c / s) if math.isfinite(s) else 0.0 for c, s in zip(claim, seen, strict=True)]
-    if len(off) < 3 or max(map(abs, off)) < CONTRADICTS:
-        return None
-    total = np.cumsum([0.0, *off])
-    wrong = [k for k in range(len(total)) if np.abs(np.diff(np.delete(total, k))).max() <= HOLDS]
-    if len(wrong) != 1:
-        return None
-    return wrong[0], math.exp(total[wrong[0]] - total[wrong[0] - 1 if wrong[0] else 1])
+def _reading(correction: Array, best: str, labels: Sequence[str]) -> str:
+    """Return a correction in words."""
+    which = np.flatnonzero(correction)
+    gives = f"{best} give{'s' * (best == 'EXIF')}"
+    times = _number(math.exp(-correction[which[0]]))
+    if len(which) == 1:
+        return f"{labels[which[0]]}: {gives} it {times} times the exposure that pixels tell"
+    between = f"{labels[which[0] - 1]} and {labels[which[0]]}"
+    return f"is a photograph missing between {between}? {gives} the second {times} times the exposure that pixels tell"
 
 
 def _total(steps: Sequence[float]) -> float:
@@ -431,7 +441,9 @@ def agree_exposures(
     Raises:
         UsageError: EXIF, names and pixels contradict each other; the message has all figures.
     """
-    seen = measure_ratios(patches, decode_table(transfer).astype(float))
+    labels = labels or [f"picture {k + 1}" for k in range(len(patches))]
+    levels, tried = _levels(patches), decode_table(transfer).astype(float)
+    seen = _steps(levels, tried, len(patches) - 1)
     steps = {
         name: tuple(b / a for a, b in itertools.pairwise(claim))
         for name, claim in (("--exposures", given), ("EXIF", exif), ("names", names))
@@ -440,52 +452,60 @@ def agree_exposures(
     if given is not None:
         steps = {"--exposures": steps["--exposures"]}
     figures = ", ".join(f"{name} say{'s' * (name == 'EXIF')} {_number(_total(s))}" for name, s in steps.items())
-    pixels = [s for s in seen.steps if math.isfinite(s)]
+    pixels = [s for s in seen if math.isfinite(s)]
     figures += f"{', ' * bool(figures)}pixels say {_number(_total(pixels))}" + " over the steps that they tell" * (
-        len(pixels) < len(seen.steps)
+        len(pixels) < len(seen)
     )
     if not steps:
-        if len(pixels) < len(seen.steps):
+        if len(pixels) < len(seen):
             raise UsageError(
                 "neither EXIF nor names give the exposures, and too few pixels can be compared; give --exposures"
             )
         note = f"exposures are from the pixels alone, with the response {transfer}: {figures} times"
-        return Exposures(tuple(np.cumprod([1.0, *seen.steps]).tolist()), None, (note,))
-    best, notes = _believed(steps, seen.steps, figures)
-    claim = steps[best]
-    ratios = tuple(np.cumprod([1.0, *claim]).tolist())
-    off = _off(claim, seen.steps)
-    wrong = _wrong_one(claim, seen.steps)
-    if wrong is not None:
-        which, times = wrong
-        notes.append(
-            f"{labels[which] if labels else f'picture {which + 1}'}: {best} give{'s' * (best == 'EXIF')} it "
-            f"{_number(times)} times the exposure that pixels tell, and all others agree: the pixels are believed"
-        )
-        ratios = tuple(ratio / times if k == which else ratio for k, ratio in enumerate(ratios))
-        return Exposures(tuple(ratio / ratios[0] for ratio in ratios), None, tuple(notes))
+        return Exposures(tuple(np.cumprod([1.0, *seen]).tolist()), None, (note,))
+    best, notes = _believed(steps, seen, figures)
+    claim, doubts = np.array(steps[best]), []
+    if _off(claim, seen) > HOLDS:
+        found = _corrections(levels, claim)
+        readings = [_reading(correction, best, labels) for correction in found]
+        corrected = [claim * np.exp(np.diff(correction)) for correction in found]
+        sure = [k for k, steps_ in enumerate(corrected) if _off(steps_, seen) <= HOLDS]
+        sure = sure or [0] * (len(found) == 1 and not known)
+        if sure:
+            claim, others = corrected[sure[0]], "; or ".join(readings[: sure[0]] + readings[sure[0] + 1 :])
+            notes.append(
+                f"{readings[sure[0]]}, and all others agree: the pixels are believed{others and f' ({others})'}"
+            )
+        elif found:
+            doubts.append(f"a time contradicts the others ({'; or '.join(readings)})")
+    ratios, off = tuple(np.cumprod([1.0, *claim]).tolist()), _off(claim, seen)
     if off <= HOLDS:
         return Exposures(ratios, None, tuple(notes))
-    bent = seen if known else estimate_response(seen, claim)
-    rest = _off(claim, bent.steps)
+    curve, _, _ = _fit(levels, claim, np.zeros(len(patches)))
+    bent = _steps(levels, curve, len(claim))
+    worst = int(np.nanargmax(np.abs(np.log(claim / bent))))
+    rest = abs(math.log(claim[worst] / bent[worst]))
     if known or rest > CONTRADICTS:
         raise UsageError(
             f"exposures contradict the pictures: from the longest to the shortest {figures} times, and no response "
-            f"explains them (a step is off by {math.expm1(rest):.0%}); give the true ones with --exposures, or "
-            "take what the pixels say (--exposures pixels)"
+            f"explains them ({labels[worst]} to {labels[worst + 1]} is off by {math.expm1(rest):.0%}); give the true "
+            "ones with --exposures, or take what the pixels say (--exposures pixels)"
         )
-    dark = decode_table(transfer)[:, 1][40] / max(bent.curve[40, 1], 1e-9)
     notes.append(
-        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code "
-        "40): it was estimated from the bracket"
+        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, "
+        f"{_number(float(tried[40, 1] / max(curve[40, 1], 1e-9)))} times at code 40): it was estimated from the bracket"
     )
-    gamma = math.log(bent.curve[40, 1]) / math.log(40 / 255)
+    needed = np.flatnonzero(np.abs(np.log(claim / seen)) > HOLDS)
+    if len(needed) == 1:
+        doubts.append(f"only the step from {labels[needed[0]]} to {labels[needed[0] + 1]} needs this response")
+    gamma = _gamma(curve)
     if not GAMMAS[0] <= gamma <= GAMMAS[1]:
-        notes.append(
-            f"no known camera has this response: gamma {gamma:.1f} in the darks, not {GAMMAS[0]} to {GAMMAS[1]}; "
-            f"if a time is wrong instead, {transfer} holds, and --exposures pixels is right ({figures} times)"
-        )
-    return Exposures(ratios, bent.curve, tuple(notes))
+        least, most = GAMMAS
+        doubts.append(f"no known camera has this response: gamma {gamma:.1f} in the darks, not {least} to {most}")
+    if doubts:
+        otherwise = f"if a time is wrong instead, {transfer} holds, and --exposures pixels is right ({figures} times)"
+        notes.append(f"{'; '.join(doubts)}; {otherwise}")
+    return Exposures(ratios, curve, tuple(notes))
 
 
 def thin_exposures(
