@@ -276,7 +276,9 @@ function showBuilding() {
   const count = building.count ? ` (${building.done} of ${building.count})` : "";
   const meanwhile = view.stats.plan ? "" : " The camera's picture is shown meanwhile.";
   const [, words, seconds] = $("building").children;
-  words.textContent = `Compiling kernels for ${building.quality}, once for this kind of scene${count}.${meanwhile}`;
+  // Seconds are for the eye alone: a status that is set anew is read out anew.
+  const text = `Compiling kernels for ${building.quality}, once for this kind of scene${count}.${meanwhile}`;
+  if (words.textContent !== text) words.textContent = text;
   seconds.textContent = `${Math.round((performance.now() - began) / 1000)} s`;
 }
 
