@@ -253,6 +253,22 @@ def test_a_moved_photograph_is_left_out_and_said(tmp_path):
     assert "most photographs differ from photo_c.jpg: if it is the odd one, show another (--shown)" in odd
 
 
+def test_another_photograph_is_shown_if_the_best_exposed_is_the_odd_one(tmp_path):
+    photos = write_bracket(tmp_path, BRACKET)
+    write_photo(photos[1], np.ascontiguousarray(exposed(60)[::-1, :500]), denominator=60)
+    found = capture_light(photos, device="cpu")
+    assert found.shown != photos[1]
+    (note,) = [note for note in found.notes if "left out" in note]
+    assert note.startswith("photo_b.jpg is left out: it shows something else")
+    assert note.endswith("and was cut or resized")
+
+
+def test_a_refusal_names_the_photograph(tmp_path):
+    write_photo(tmp_path / "a.jpg", np.full((90, 120, 3), 90, np.uint8))
+    with pytest.raises(UsageError, match=r"^a\.jpg: no ball was found in the picture"):
+        capture_light([tmp_path / "a.jpg"], device="cpu")
+
+
 def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(bracket, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("warp_ar.capture.capture_light", None)
     (tmp_path / "file").write_text("mine")

@@ -130,13 +130,28 @@ def capture_light(
         raise UsageError(f"{len(exposures)} exposures for {len(photos)} photographs; expected one for each")
     if shown is not None and not 0 <= shown < len(photos):
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
-    reference = photos[shown] if shown is not None else photos[_best_exposed(photos)]
-    camera, notes = _camera_of(reference, transfer, focal_35mm)
-    if circle is None:
-        outline, taken_from = _find_outline(photos, reference, camera, ball)
-    else:
-        outline, taken_from = exact_outline(reference.image, camera, circle), None
-    bracket = _merge_plan(photos, reference, outline, transfer, exposures)
+    # The best exposed, and another one if most differ from it: the odd one may be any.
+    order = [shown] if shown is not None else _by_exposure(photos)[: 2 if circle is None and len(photos) > 2 else 1]
+    plans: list[Any] = []
+    problem = None
+    for reference in (photos[k] for k in order):
+        camera, notes = _camera_of(reference, transfer, focal_35mm)
+        try:
+            if circle is None:
+                near = photos if shown is not None else [reference]
+                outline, taken_from = _find_outline(near, reference, camera, ball)
+            else:
+                outline, taken_from = exact_outline(reference.image, camera, circle), None
+            bracket = _merge_plan(photos, reference, outline, transfer, exposures)
+        except UsageError as error:
+            problem = problem or error
+            continue
+        plans.append((reference, camera, notes, outline, taken_from, bracket))
+        if not bracket.is_odd:
+            break
+    if problem is not None and not plans:
+        raise problem
+    reference, camera, notes, outline, taken_from, bracket = plans[0 if plans[-1][-1].is_odd else -1]
     notes += [*bracket.notes, _describe_outline(outline)]
     if taken_from is not None:
         notes.append(
@@ -199,15 +214,15 @@ def _ball_reflectance(table: Table | None, given: float | None) -> tuple[RGB, st
     return (given,) * 3, f"the ball reflects {given:g}, as given{looks}"
 
 
-def _best_exposed(photos: Sequence[Photograph]) -> int:
-    """Return the index of the photograph whose middle has the most pixels that are neither dark nor clipped."""
+def _by_exposure(photos: Sequence[Photograph]) -> list[int]:
+    """Return the indices of photographs, those first whose middle has the most pixels neither dark nor clipped."""
 
     def share(photo: Photograph) -> float:
         h, w = photo.image.shape[:2]
         middle = photo.image[h // 8 : -h // 8 : 8, w // 8 : -w // 8 : 8].max(2)
         return float(((middle > 30) & (middle < 245)).mean()) if middle.size else 0.0
 
-    return max(range(len(photos)), key=lambda k: share(photos[k]))
+    return sorted(range(len(photos)), key=lambda k: -share(photos[k]))
 
 
 def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tuple[Camera, list[str]]:
@@ -236,10 +251,10 @@ def _find_outline(
         The outline; and the best exposed photograph if the outline is taken from it, because the shown one shows no
             rim, else None.
     """
-    clearest = photos[_best_exposed(photos)]
+    clearest = photos[_by_exposure(photos)[0]]
     if ball is not None or clearest is reference:
-        return find_ball(reference.image, camera, ball), None
-    seen = find_ball(clearest.image)
+        return _find_ball(reference, camera, ball), None
+    seen = _find_ball(clearest)
     rough = _same_place((*seen.center, seen.radius), clearest.image, reference.image)
     try:
         own, taken_from = find_ball(reference.image, camera, rough, NEAR), None
@@ -258,6 +273,13 @@ def _find_outline(
         )
         taken_from = clearest
     return dataclasses.replace(own, evidence=seen.evidence), taken_from
+
+
+def _find_ball(photo: Photograph, camera: Camera | None = None, ball: Sequence[float] | None = None) -> BallOutline:
+    try:
+        return find_ball(photo.image, camera, ball)
+    except UsageError as problem:
+        raise UsageError(f"{photo.name}: {problem}") from problem
 
 
 def _same_place(circle: Circle, of: Image, other: Image) -> Circle:
@@ -283,6 +305,8 @@ class _Bracket:
     ratios: tuple[float, ...]
     curve: Array | None
     notes: tuple[str, ...]
+    is_odd: bool = False
+    """Whether most photographs differ from the shown one."""
 
     @property
     def deep(self) -> NDArray[np.uint16] | None:
@@ -319,8 +343,14 @@ def _merge_plan(
     times = None if known is None else [known[k] for k in order]
     rough = [_same_place(circle, reference.image, photo.image) for photo in chosen]
     aligned = align([photo.image for photo in chosen], rough, times, chosen.index(reference))
-    notes = [f"{photo.name} is left out: {why}" for photo, why in zip(chosen, aligned.strangers, strict=True) if why]
-    if 2 * sum(map(bool, aligned.strangers)) >= len(photos):
+    cut = [", and was cut or resized" * (photo.image.shape != reference.image.shape) for photo in chosen]
+    notes = [
+        f"{one.name} is left out: {why}{how}"
+        for one, why, how in zip(chosen, aligned.strangers, cut, strict=True)
+        if why
+    ]
+    is_odd = 2 * sum(map(bool, aligned.strangers)) >= len(photos)
+    if is_odd:
         notes.append(f"most photographs differ from {reference.name}: if it is the odd one, show another (--shown)")
     notes += [f"{photo.name} has no exposure in EXIF, so EXIF is not used" for photo in untold]
     notes += _shift_notes(chosen, aligned, rough, outline.radius)
@@ -338,6 +368,7 @@ def _merge_plan(
         tuple(agreed.ratios[k] for k in kept),
         agreed.curve,
         (*notes, *agreed.notes, *more),
+        is_odd,
     )
 
 
