@@ -294,6 +294,7 @@ def test_scene_files_have_them_as_lights_and_as_objects(kind, keys):
 CELL_MEAN, CELL_WORST = 0.01, 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["coarse", "fine"])
 def test_cells_know_the_light_that_each_pixel_would_ask_for(device, method):
     """A receiver under a rect, in a box's shadow too."""
