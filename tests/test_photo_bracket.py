@@ -12,7 +12,7 @@ from tests.photo_room import exposed, photograph, sphere
 from warp_ar.ball.ball_finder import silhouette
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
-from warp_ar.photographs.bracket import MOVED, agree_exposures, align, register
+from warp_ar.photographs.bracket import MOVED, agree_exposures, align, find_soft, register
 
 TENTH = 0.1
 """Pixels: what alignment is asked for."""
@@ -160,6 +160,15 @@ def test_a_picture_of_another_light_is_told_from_another_exposure():
     found = align([plain, turned, exposed(120).astype(np.uint8)], [circle()] * 3)
     assert found.strangers[0] == found.strangers[2] == ""
     assert "its light differs" in found.strangers[1]
+
+
+@pytest.mark.parametrize("blurred", [None, 1, 2])
+def test_a_blurred_picture_is_softer_than_both_neighbours(blurred):
+    images = [exposed(d).astype(np.uint8) for d in BRACKET]
+    if blurred is not None:
+        images[blurred] = cv2.GaussianBlur(images[blurred], (0, 0), 2.0)
+    found = align(images, [circle()] * 4, anchor=2 if blurred == 1 else 1)
+    assert find_soft(found.patches) == [k for k in [blurred] if k is not None]
 
 
 def test_without_any_claim_the_pixels_decide():

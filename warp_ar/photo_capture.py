@@ -23,7 +23,7 @@ from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.recovery.recover_cells import cell_shape
 from warp_ar.light.captured import Light, find_emitters, irradiance_above, texel_solid_angles
 from warp_ar.light.priors import least_missing
-from warp_ar.photographs.bracket import Aligned, Circle, agree_exposures, align, thin_exposures
+from warp_ar.photographs.bracket import Aligned, Circle, agree_exposures, align, find_soft, thin_exposures
 from warp_ar.photographs.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
 from warp_ar.photographs.support import Support, card_points, plane_from_points
 from warp_ar.photographs.table_seen import WHITEST, Table
@@ -355,6 +355,8 @@ def _merge_plan(
     notes += [f"{photo.name} has no exposure in EXIF, so EXIF is not used" for photo in untold]
     notes += _shift_notes(chosen, aligned, rough, outline.radius)
     stay = [k for k, why in enumerate(aligned.strangers) if not why]
+    soft = find_soft([aligned.patches[k] for k in stay])
+    notes += [f"{chosen[stay[k]].name} is blurred: leave it out if the others show all of the light" for k in soft]
     picked = {name: None if claim is None else [claim[order[k]] for k in stay] for name, claim in claims.items()}
     agreed = agree_exposures(
         [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"],

@@ -52,6 +52,8 @@ FLAT = 30
 """Range of codes around a pixel above which it is near an edge, where blur mixes clipped with other pixels."""
 LEAST_PIXELS = 400
 """Smallest number of pixels well exposed in two pictures for a ratio."""
+SOFT = 2.6
+"""Squared ratio of gradients above which a picture is softer than both of its neighbours: 2.2 by noise."""
 HOLDS = 0.12
 """Largest difference, as a logarithm, between an exposure step and the pixels' ratio."""
 CONTRADICTS = 0.3
@@ -362,6 +364,22 @@ def _corrections(levels: Array, steps: Array) -> list[Array]:
 def _gamma(curve: Array) -> float:
     """Return a response's gamma in the darks, at code 40."""
     return math.log(max(curve[40, 1], 1e-9)) / math.log(40 / 255)
+
+
+def find_soft(patches: Sequence[Image]) -> list[int]:
+    """Return the indices of pictures whose gradients are weaker than those of both neighbours, relative to the light.
+
+    Noise and rounding make gradients grow from each exposure to the next, so a picture is compared with both sides.
+    """
+    disc, sharper = _disc(len(patches[0])), []
+    light = [_LOG_SRGB[cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY)] for patch in patches]
+    bounds = _LOG_SRGB[[DARKEST, BRIGHTEST]]
+    for pair in itertools.pairwise(cv2.GaussianBlur(picture, (0, 0), 1.0) for picture in light):
+        well = np.all([(picture > bounds[0]) & (picture < bounds[1]) for picture in pair], 0) & disc
+        well = cv2.erode(well.astype(np.uint8), np.ones((5, 5))) > 0
+        energy = [sum((cv2.Sobel(one, -1, *way)[well] ** 2).sum() for way in ((1, 0), (0, 1))) for one in pair]
+        sharper.append(math.sqrt(energy[0] / energy[1]) if well.sum() >= LEAST_PIXELS else math.nan)
+    return [k + 1 for k, (before, after) in enumerate(itertools.pairwise(sharper)) if before > SOFT * after]
 
 
 @dataclasses.dataclass(frozen=True)
