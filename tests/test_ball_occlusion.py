@@ -133,6 +133,7 @@ def test_a_frame_without_the_ball_in_it_is_no_cover():
         assert not occlusion.observe(image, discs, pose, STEP * index, np.ones(3))
 
 
+@pytest.mark.slow
 def test_covered_frames_leave_the_light_alone(device):
     scene = loads_scene(SCENE + OBJECT)
     bare, hand = encode(picture(scene)), encode(with_hand(picture(scene), scene))

@@ -93,6 +93,7 @@ def test_objects_lights_and_proxies_ride(device: str) -> None:
     np.testing.assert_allclose(objects["scale"], 1.0)
 
 
+@pytest.mark.slow
 def test_a_frame_shows_an_object_on_its_card(device: str) -> None:
     """The object is where the card is, follows it, and is gone once the card has been gone for a while."""
     scene = Scene(
