@@ -9,10 +9,10 @@ from PIL.TiffImagePlugin import IFDRational
 FOCAL_35MM = 35
 
 
-def encode_srgb(linear):
+def encode_srgb(linear, most=255):
     """Codes of linear values, clipped at 1."""
     x = np.clip(linear, 0.0, 1.0)
-    return np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055))
+    return np.round(most * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055))
 
 
 def write_photo(path, codes, *, denominator=None, iso=100, f_number=1.0, focal_35mm=FOCAL_35MM, orientation=None):

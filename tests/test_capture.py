@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.photo_files import FOCAL_35MM, write_dng, write_photo
+from tests.photo_files import FOCAL_35MM, encode_srgb, write_dng, write_photo
 from tests.photo_room import GAIN, environment, exposed, photograph, project, write_bracket
 from tests.test_photo_bracket import s_curve
 from warp_ar.ball.ball_finder import find_ball
@@ -285,3 +285,17 @@ def test_a_scene_needs_a_plane(bracket, tmp_path, capsys):
     assert main([str(bracket[1]), *files]) == EXIT_USAGE
     assert "photo.toml needs the plane: give --rectangle and --rectangle-size, or --contact" in capsys.readouterr().err
     assert not (tmp_path / "light.exr").exists()
+
+
+def test_photographs_of_16_bits_are_merged_in_16_bits(tmp_path):
+    """Both are so dark that 8 bits round the walls to code 0 or 1, which errs by a factor of 20 in the median."""
+    dark, photos = (60000, 240000), []
+    for denominator in dark:
+        codes = encode_srgb(GAIN / denominator * photograph()[0].astype(float), 65535)
+        photos.append(tmp_path / f"{denominator}.png")
+        cv2.imwrite(str(photos[-1]), codes.astype(np.uint16)[..., ::-1])
+    known = {"reflectance": REFLECTANCE, "focal_35mm": FOCAL_35MM, "circle": (272.0, 226.0, 48.5), "device": "cpu"}
+    light = capture_light(photos, shown=0, exposures=[1 / d for d in dark], **known).light
+    off = np.abs(np.log(np.maximum(reduced(light), 1e-9) / (environment() * GAIN / dark[0])))
+    # Half of it is the small map's texels, whose edges are apart.
+    assert np.median(off[cv2.resize(light.confidence, (64, 32)) > 0.5]) < 0.5

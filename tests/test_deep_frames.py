@@ -266,8 +266,6 @@ def test_what_no_deep_frame_is_gets_one_line(first: np.ndarray) -> None:
             pipeline(first.astype(np.int64))
         with pytest.raises(UsageError, match=r"frame is float32 \(2, 2, 3\); expected"):
             pipeline(DeepFrame(np.zeros((2, 2, 3), np.float32)))
-    with pytest.raises(UsageError, match="linear frames of several exposures"):
-        warp_ar.Pipeline("desk", device="cpu", linear=True, exposures=(0.01, 0.001))
 
 
 def probe(path: pathlib.Path) -> dict[str, str]:

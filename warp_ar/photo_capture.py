@@ -309,9 +309,9 @@ class _Bracket:
     """Whether most photographs differ from the shown one."""
 
     @property
-    def deep(self) -> NDArray[np.uint16] | None:
-        """Return the only photograph in 16 bits; None if there are more, which are merged in 8 bits, or it has 8."""
-        return self.photos[0].deep if len(self.photos) == 1 else None
+    def is_deep(self) -> bool:
+        """Return True if all photographs have 16 bits; else all are merged in 8 bits."""
+        return all(photo.deep is not None for photo in self.photos)
 
 
 def _merge_plan(
@@ -438,7 +438,7 @@ def _unwrap(
             exposures=times if len(times) > 1 else (),
             shown=times[index] if len(times) > 1 else None,
             estimates="synchronous",
-            linear=bracket.deep is not None,
+            linear=bracket.is_deep,
         )
     with pipeline:
         order = [*(k for k in range(len(times)) if k != index), index]
@@ -525,7 +525,8 @@ def _place(
     x0, y0, side = window
     x, y, radius = bracket.circles[k]
     dx, dy = round(x - own[0]), round(y - own[1])
-    image = bracket.photos[k].image if bracket.deep is None else bracket.deep
+    photo = bracket.photos[k]
+    image = photo.deep if bracket.is_deep and photo.deep is not None else photo.image
     h, w = image.shape[:2]
     rows = np.clip(np.arange(y0 + dy, y0 + dy + side), 0, h - 1)
     columns = np.clip(np.arange(x0 + dx, x0 + dx + side), 0, w - 1)

@@ -39,15 +39,13 @@ def check_methods(quality: Quality) -> None:
             raise UsageError(f"quality: methods: {stage!r} by {method!r}: {right}")
 
 
-def check_frames(exposures: Sequence[float], outputs: tuple[str, ...], linear: bool) -> tuple[str, ...]:
+def check_frames(exposures: Sequence[float], outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Check the arguments that describe frames; return the outputs with ``radiance`` expanded to its layers.
 
     Raises:
-        UsageError: An exposure is invalid, an output is unknown, or linear frames have several exposures.
+        UsageError: An exposure is invalid, or an output is unknown.
     """
     for exposure in exposures:
         check_number("exposures", exposure, above=0.0)
     check_outputs(outputs)
-    if linear and exposures:
-        raise UsageError("linear frames of several exposures cannot be merged; give them as 8-bit codes")
     return expand_outputs(outputs)

@@ -409,12 +409,16 @@ class FrameInputs:
             self._bent, self._bent_table = contrast, table.astype(np.float32)
         return decode_deep(deep.picture, self._bent_table)
 
+    def linear(self, deep: DeepFrame) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Return the linear radiance of a deep frame and its levels of clipping."""
+        return self.radiance(deep), deep.clip_levels(str(self._camera.transfer), self.saturation.levels)
+
     def _take_deep(self, frame: SeenFrame) -> bool:
         """Write the frame's linear radiance for the stages; return False if no stage reads it."""
         if frame.deep is None or not self._linear_frame.size:
             return False
-        self._linear_frame.assign(self.radiance(frame.deep))
-        self._linear_clip.assign(frame.deep.clip_levels(str(self._camera.transfer), self.saturation.levels))
+        for array, values in zip((self._linear_frame, self._linear_clip), self.linear(frame.deep), strict=True):
+            array.assign(values)
         return True
 
     def receive(self) -> None:

@@ -161,7 +161,7 @@ class Pipeline(Closing):
                 ``size``.
         """
         scene = scene if isinstance(scene, Scene) else load_scene(scene)
-        outputs = check_frames(exposures, outputs, linear)
+        outputs = check_frames(exposures, outputs)
         if shown is not None:
             check_number("shown", shown, above=0.0)
         for name, numbers in (("size", size), ("bands", bands)):
@@ -568,7 +568,7 @@ class Pipeline(Closing):
         if not handed_over or exposure != self.bracket.reference:
             self._finish()
         if exposure != self.bracket.reference:
-            return self._take_short(image, host_image, exposure, now, pose)
+            return self._take_short(image, host_image, exposure, now, pose, deep)
         frame, state = self._look(image if host_image is None else host_image, now, pose, deep)
         if handed_over:
             return Result(frame.pose, state, self._hand_over(frame))
@@ -709,7 +709,13 @@ class Pipeline(Closing):
         return layer_arrays(request, self._arrays)
 
     def _take_short(
-        self, image: Any, host_image: Image | None, exposure: int | None, now: float, given: Pose | Track | None
+        self,
+        image: Any,
+        host_image: Image | None,
+        exposure: int | None,
+        now: float,
+        given: Pose | Track | None,
+        deep: DeepFrame | None,
     ) -> Result:
         """Measure light from a frame of another exposure, unless the plan has no ``bracket``; the picture stays."""
         timings: dict[str, StageTiming] = {}
@@ -722,7 +728,8 @@ class Pipeline(Closing):
         if self._short is not None and pose is not None and exposure is not None:
             start = time.perf_counter()
             with exclusive(self.device):
-                self._short.take(image, exposure, pose, self.inputs.block.host("params"), now)
+                params, linear = self.inputs.block.host("params"), None if deep is None else self.inputs.linear(deep)
+                self._short.take(image, exposure, pose, params, now, linear)
             timings["unwrap"] = StageTiming((time.perf_counter() - start) * 1e3, False)
         self._last_time = now
         shown = bright if self._shown is None else self._shown

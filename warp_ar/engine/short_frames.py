@@ -51,12 +51,22 @@ class ShortFrames:
             self._own.add(name, arrays[name])
         with wp.ScopedDevice(device):
             self._own.add("frame", wp.zeros(arrays["frame"].shape, dtype=wp.vec3ub))
+            self._own.add("linear_frame", wp.zeros(arrays["linear_frame"].shape, dtype=wp.vec3))
+            self._own.add("linear_clip", wp.zeros(2, dtype=wp.vec3))
             self._own.add("params", wp.zeros(1, dtype=FrameParams))
             for name, spec in stage.arrays().items():
                 self._own.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
             self._passes = stage.build(self._own, device)
 
-    def take(self, image: Any, index: int, pose: Pose, params: npt.NDArray[Any], now: float) -> None:
+    def take(
+        self,
+        image: Any,
+        index: int,
+        pose: Pose,
+        params: npt.NDArray[Any],
+        now: float,
+        linear: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None,
+    ) -> None:
         """Unwrap one frame.
 
         Args:
@@ -65,6 +75,7 @@ class ShortFrames:
             pose: ``camera_from_world``.
             params: Frame constants of the pipeline; only the pose is replaced.
             now: Time of the frame, seconds.
+            linear: Its linear radiance and the radiance that clips, if it has more than 8 bits.
         """
         values = params.copy()
         inverse = pose.inverse()
@@ -74,6 +85,9 @@ class ShortFrames:
             wp.copy(self._own["frame"], image)
         else:
             self._own["frame"].assign(image)
+        if linear is not None:
+            self._own["linear_frame"].assign(linear[0])
+            self._own["linear_clip"].assign(linear[1])
         for step in self._passes:
             step.launch(None)
         for part in UNWRAPPED:
