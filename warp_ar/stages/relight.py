@@ -37,9 +37,12 @@ class Grain:
     """Pixels per patch that reflects bounced light, likewise."""
 
 
-_GRAIN = Grain(128, 4, 8, 16)
 GRAINS: Mapping[str, Grain] = MappingProxyType(
-    {"reflectance": _GRAIN, "bounce": _GRAIN, "brute_force": Grain(SAMPLES, 1, 1, 4)}
+    {
+        "reflectance": Grain(64, 8, 8, 16),
+        "bounce": Grain(128, 4, 8, 16),
+        "brute_force": Grain(SAMPLES, 1, 1, 4),
+    }
 )
 """Resolutions of the methods that measure the receiver's reflectance."""
 
