@@ -306,7 +306,7 @@ class _Bracket:
     curve: Array | None
     notes: tuple[str, ...]
     is_odd: bool = False
-    """Whether most photographs differ from the shown one."""
+    """Return True if most photographs differ from the shown one."""
 
     @property
     def is_deep(self) -> bool:
