@@ -61,7 +61,7 @@ def make_preset_list(reports: Sequence[CaseReport], device: str) -> dict[str, An
 def _presets(reports: Sequence[CaseReport]) -> dict[str, dict[str, dict[str, float]]]:
     return {
         report.case.name: {
-            whole.label: {"error": round(whole.flip, 4), "ms": round(whole.milliseconds, 3)}
+            whole.label: {"error": round(whole.flip, 4), "ms": round(whole.milliseconds, 2)}
             for whole in report.wholes
             if whole.label in PRESETS
         }
