@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import cv2
@@ -11,12 +12,13 @@ import trimesh
 import warp as wp
 
 from tests.farm_rig import SIZE, make_jobs, write_recording
+from tests.kernel_rig import look_at
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm.jobs import Context, Job
 from warp_ar.farm.labels import DEPTH_SCALE
 from warp_ar.farm.work import Work
 from warp_ar.kernels.picture.object_masks import trace_object_masks
-from warp_ar.scene import load_scene
+from warp_ar.scene import Object, load_scene
 
 pytestmark = pytest.mark.slow
 
@@ -171,10 +173,6 @@ def test_the_scene_shows_the_variation_again(made):
 
 def test_silhouettes_are_those_of_each_object_alone(device):
     """Objects one behind the other: the hidden one's bits are those it has in a scene of its own."""
-    import dataclasses
-
-    from warp_ar.scene import Object
-
     items = (
         Object("sphere", radius=0.05, at=(0.0, 0.1, 0.06)),
         Object("box", size=(0.06, 0.2, 0.03), at=(0.02, 0.25, 0.05), rotate=(0.0, 20.0, 30.0)),
@@ -182,7 +180,7 @@ def test_silhouettes_are_those_of_each_object_alone(device):
     )
     image = np.full((480, 640, 3), 128, np.uint8)
     desk = load_scene("desk")
-    pose = None
+    pose = look_at((0.1, -0.5, 0.3))
 
     def masks(objects):
         scene = dataclasses.replace(desk, objects=objects, lights=(), probes=(), proxies=())
@@ -193,9 +191,6 @@ def test_silhouettes_are_those_of_each_object_alone(device):
             trace_object_masks(arrays["params"], arrays["rays"], arrays["ray_scene"], out)
             return out.numpy()
 
-    from tests.test_farm_variations import looking_down
-
-    pose = looking_down(0.1, -0.5, 0.3)
     together = masks(items)
     for index, item in enumerate(items):
         alone = masks((item,))
