@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -125,6 +127,30 @@ def test_threads_end_though_the_source_cannot_be_closed(monkeypatch: pytest.Monk
         session.close()
     with pytest.raises(UsageError, match="closed"):
         pipeline.warm_up()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_fork_of_a_session_that_iterates_is_told() -> None:
+    """Neither its next frame nor its end waits for a thread of the parent, which goes on."""
+    with Session(scene(), device="cpu", quality="paper") as session:
+        frames = iter(session)
+        next(frames)
+        read, write = os.pipe()
+        if (child := os.fork()) == 0:
+            signal.alarm(20)
+            try:
+                next(frames)
+            except UsageError as error:
+                session.close()
+                os.write(write, str(error).encode())
+            finally:
+                os._exit(0)
+        os.close(write)
+        with os.fdopen(read, "rb") as told:
+            assert b"start processes by spawn" in told.read()
+        os.waitpid(child, 0)
+        assert next(frames)[1].image.any()
 
 
 def test_a_former_name_warns() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import hashlib
+import os
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ from warp_ar.closing import Closing
 from warp_ar.declared import checked
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.errors import UsageError, WarpArError, warn_renamed
+from warp_ar.errors import UsageError, WarpArError, check_process, warn_renamed
 from warp_ar.light.captured import Light
 from warp_ar.light.card_light import light_by_card
 from warp_ar.output.environment_file import write_environment
@@ -166,6 +167,7 @@ class Session(Closing):
             SourceError: The source cannot be opened.
             UsageError: Any other argument cannot be used.
         """
+        self._process = os.getpid()
         scene = chosen_scene(scene, source, calibration, None if light == BY_CARD else light, light_axes)
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
@@ -222,6 +224,8 @@ class Session(Closing):
 
     def close(self) -> None:
         """Close the source, and end the pipeline's threads."""
+        if os.getpid() != self._process:
+            return  # a fork has neither the threads nor the device
         try:
             self.source.close()
         finally:
@@ -273,6 +277,14 @@ class Session(Closing):
             yield pair
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
+        pairs = self._pairs()
+        while True:
+            check_process("the session was opened", self._process)
+            if (pair := next(pairs, None)) is None:
+                return
+            yield pair
+
+    def _pairs(self) -> Iterator[tuple[Frame, Result]]:
         pipeline, live = self.pipeline, self.source.live
         on_cpu = pipeline.device.is_cpu
         kept = on_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}

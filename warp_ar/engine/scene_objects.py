@@ -179,6 +179,8 @@ def find(items: Sequence[Object], key: str | int) -> int:
         return found[0]
     if found:
         raise UsageError(f"objects: {len(found)} have the name {key!r}; give each its own, or use its number")
+    if not items:
+        raise UsageError(f"objects: there is no {key!r}: the scene has no objects")
     names = [item.name for item in items if item.name is not None]
     known = nearest(str(key), names) if names else "none has a name"
     raise UsageError(f"objects: there is no {key!r}: {known}; numbers run from 0 to {len(items) - 1}")

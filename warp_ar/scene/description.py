@@ -71,7 +71,7 @@ class Camera(Checked):
     def __post_init__(self) -> None:
         """Check all values."""
         super().__post_init__()
-        if isinstance(self.transfer, str) and not is_formula(self.transfer) and not is_file(self.transfer):
+        if not is_formula(str(self.transfer)) and not is_file(self.transfer):
             fail(self, "transfer", f"expected {TRANSFERS}")
 
     @classmethod
