@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.kernel_rig import look_at
+from warp_ar.accuracy import light_places
 from warp_ar.accuracy.light_places import place_emitters
 from warp_ar.accuracy.path_tracer import PathTracer
 from warp_ar.errors import UsageError
@@ -20,7 +21,7 @@ from warp_ar.scene import Camera, Pose, Probe, Proxy, Scene
 pytestmark = pytest.mark.slow
 
 SCENE = Scene(
-    Camera(160, 120, 160.0, 160.0, 79.5, 59.5),
+    Camera(80, 60, 80.0, 80.0, 39.5, 29.5),
     proxies=(
         Proxy("plane", size=(1.6, 1.2)),
         Proxy("box", size=(0.2, 0.06, 0.08), at=(0.03, 0.22, 0.04)),
@@ -34,6 +35,12 @@ TOWARD = np.array((-0.47, 0.45, 0.76)) / np.linalg.norm((-0.47, 0.45, 0.76))
 DISTANCE_TOLERANCE = 0.12
 GRAIN = 0.3
 """Deviation of the logarithm of a reflectance from texel to texel: more than wood has."""
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure reflectance at the pictures' own size: each trial distance is a picture."""
+    monkeypatch.setattr(light_places, "WIDTH", SCENE.camera.width)
 
 
 def lamp_light(distance: float | None) -> Light:
@@ -74,14 +81,14 @@ def test_a_lamp_is_found_where_it_stands(distance: float, device: str) -> None:
 
 def test_light_from_afar_stays_there(device: str) -> None:
     """Where nothing falls off, nothing is near, whatever grain the desk has."""
-    grain = np.exp(GRAIN * np.random.default_rng(3).standard_normal((120, 160, 1))).astype(np.float32)
+    grain = np.exp(GRAIN * np.random.default_rng(3).standard_normal((60, 80, 1))).astype(np.float32)
     for frame in (under_lamp(None), np.minimum(under_lamp(None) * grain, 0.9)):
         assert distances(place_emitters(lamp_light(None), SCENE, frame, POSE, device=device)) == [None]
 
 
 def test_paint_that_is_darker_to_one_side_is_no_lamp(device: str) -> None:
     """Hard case: under light from afar, a desk that falls off as under a near lamp."""
-    paint = np.linspace(1.0, 0.5, 120, dtype=np.float32)[:, None, None]
+    paint = np.linspace(1.0, 0.5, 60, dtype=np.float32)[:, None, None]
     assert distances(place_emitters(lamp_light(None), SCENE, under_lamp(None) * paint, POSE, device=device)) == [None]
 
 
@@ -97,11 +104,11 @@ def test_emitters_are_found_in_an_image_of_light(device: str) -> None:
 
 def test_what_is_known_stays_as_it_is(device: str) -> None:
     light = lamp_light(0.7)
-    assert place_emitters(light, SCENE, np.zeros((120, 160, 3), np.float32), POSE, device=device) is light
+    assert place_emitters(light, SCENE, np.zeros((60, 80, 3), np.float32), POSE, device=device) is light
 
 
 def test_what_tells_nothing_is_named(device: str) -> None:
-    frame = np.full((120, 160, 3), 0.3, np.float32)
+    frame = np.full((60, 80, 3), 0.3, np.float32)
     with pytest.raises(UsageError, match="mirror ball"):
         place_emitters(lamp_light(None), dataclasses.replace(SCENE, probes=()), frame, POSE, device=device)
     with pytest.raises(UsageError, match="no proxy"):
@@ -109,5 +116,5 @@ def test_what_tells_nothing_is_named(device: str) -> None:
 
 
 def test_even_light_has_no_emitters(device: str) -> None:
-    frame = np.full((120, 160, 3), 0.3, np.float32)
+    frame = np.full((60, 80, 3), 0.3, np.float32)
     assert place_emitters(np.ones((16, 32, 3), np.float32), SCENE, frame, POSE, device=device).emitters == ()
