@@ -584,7 +584,7 @@ def test_a_users_own_scene_names_any_file(tmp_path: pathlib.Path) -> None:
         (sc.CapturedLight, {"file": 3}, "file = 3: expected a path"),
         (sc.AreaLight, {"kind": "rect", "intensity": 1, "at": (0, 0, 1)}, "expected 2 lengths above 0"),
         (sc.Camera.guessed, {"width": 9, "height": 9, "field_of_view": 60.0, "transfer": "foo"}, "transfer = 'foo'"),
-        (sc.Camera.guessed, {"width": 9, "height": 9, "field_of_view": 60.0, "transfer": Path("foo")}, "transfer = "),
+        (sc.Camera.guessed, {"width": 9, "height": 9, "field_of_view": 9, "transfer": pathlib.Path("foo")}, "transfer"),
     ],
 )
 def test_what_cannot_be_is_named(make: Any, values: dict[str, Any], message: str) -> None:
