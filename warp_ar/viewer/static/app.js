@@ -35,10 +35,10 @@ connection.addEventListener("hello", ({ detail }) => {
   run = detail.run;
   $("scene-name").replaceChildren(...detail.scenes.map((name) => new Option(name, name)));
   const group = document.createElement("optgroup");
-  group.label = "another preset";
-  group.append(...detail.presets.map((name) => new Option(`Split: ${name}`, name)));
-  const traced = [new Option("Split: path tracing", "traced"), new Option("Split: difference to it", "difference")];
-  $("compare").replaceChildren(new Option("Split: off", ""), new Option("Split: camera", "camera"), ...traced, group);
+  group.label = "Another preset";
+  group.append(...detail.presets.map((name) => new Option(name, name)));
+  const traced = [new Option("Traced", "traced"), new Option("Difference", "difference")];
+  $("compare").replaceChildren(new Option("No split", ""), new Option("Camera", "camera"), ...traced, group);
   quality.presets = detail.presets;
   setup.outside = detail.outside;
 });
