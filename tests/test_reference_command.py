@@ -12,7 +12,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from warp_ar.accuracy import known_frame
+from warp_ar.accuracy import known_frame, light_places
 from warp_ar.accuracy.known_frame import KnownFrame, light_of, light_up_to
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
@@ -64,7 +64,10 @@ def test_it_stops_at_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert "64x48, 16 samples a pixel" in capsys.readouterr().out
 
 
-def test_places_of_a_given_light_are_told_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_places_of_a_given_light_are_told_and_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(light_places, "WIDTH", 64)  # each trial distance is a picture
     given, saved = tmp_path / "given.exr", tmp_path / "deep" / "placed.exr"
     radiance = np.full((32, 64, 3), 0.2, np.float32)
     radiance[6, 40] = 200.0
