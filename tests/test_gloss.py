@@ -141,8 +141,8 @@ def test_a_mirror_shows_a_ball_where_geometry_says(device):
 @pytest.mark.parametrize("roughness", [0.3, 0.8])
 def test_a_rough_receiver_is_the_integral_over_its_lobe(device, roughness):
     """GGX as printed, in float64, over the cone that the ball fills."""
-    got = run((roughness, F0), samples=4096)
-    peak = np.abs(got).max()
+    got = run((roughness, F0), samples=4096, rows=(24, 41))
+    peak = np.abs(got[24:41]).max()
     for row, column in ((24, 32), (30, 30), (36, 36), (40, 20)):
         expected = reference.rough(EYE, directions()[row, column], CENTER, RADIUS, DIFFERENCE, F0, roughness**2)
         np.testing.assert_allclose(got[row, column], expected, rtol=RAYS_ERROR, atol=0.01 * peak)
@@ -195,7 +195,7 @@ def test_a_sphere_has_a_wider_highlight(device, roughness, radius, seen):
     got = run((roughness, F0), lights=[lamp], objects=(), pose=pose)
     point = run((roughness, F0), lights=[{**lamp, "radius": 0.0}], objects=(), pose=pose)
     pixels = np.argwhere(np.maximum(got, point).max(-1) > LEAST_HIGHLIGHT)
-    pixels = pixels[:: max(len(pixels) // 100, 1)]
+    pixels = pixels[:: max(len(pixels) // 40, 1)]
     radiance, place = np.array(LAMP["intensity"]) / (np.pi * radius**2), np.array(lamp["position"])
     expected = np.array(
         [reference.rough(eye, directions(pose)[i, j], place, radius, radiance, F0, roughness**2) for i, j in pixels]
@@ -217,9 +217,9 @@ def test_a_sphere_has_a_wider_highlight(device, roughness, radius, seen):
 def test_grazing_view(device, height, roughness):
     """Fresnel goes to 1, masking to 0: finite, and no more than the surroundings differ by."""
     eye = np.array([0.0, -0.4, height])
-    got = run((roughness, F0), pose=look_at(eye, np.array([0.0, 0.0, 0.0])), lights=[LAMP], samples=16)
+    got = run((roughness, F0), pose=look_at(eye, np.array([0.0, 0.0, 0.0])), lights=[LAMP])
     assert np.isfinite(got).all()
-    plain = run((roughness, F0), pose=look_at(eye, np.array([0.0, 0.0, 0.0])), samples=16)
+    plain = run((roughness, F0), pose=look_at(eye, np.array([0.0, 0.0, 0.0])))
     assert (np.abs(plain) <= np.abs(DIFFERENCE).max() + 1e-4).all()
 
 
