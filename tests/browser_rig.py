@@ -115,15 +115,15 @@ def chromium(camera_file: Path | None = None) -> Iterator[Any]:
         browser.close()
 
 
-# A camera that is a canvas: thirty frames a second of one picture, until another is shown.
+# A camera that is a canvas: ten frames a second of one picture, until another is shown.
 CANVAS_CAMERA = """
 const canvas = Object.assign(document.createElement("canvas"), { width: 640, height: 480 });
 const context = canvas.getContext("2d", { alpha: false });
 const pictures = [];
 let shown = null, since = 0, first = null, seen = 0;
 const draw = () => shown && context.drawImage(shown, 0, 0);
-setInterval(draw, 33);
-navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(30);
+setInterval(draw, 100);
+navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(10);
 window.canvasCamera = {
   async add(coded) {
     const bytes = Uint8Array.from(atob(coded), (letter) => letter.charCodeAt(0));

@@ -81,8 +81,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Note in every report which hard cases a test covers; leave slow tests out of runs of whole folders."""
     from tests.hard_cases import atlas
 
-    # They compile what the hard cases need, too: of two processes the second one begins with other tests.
-    items.sort(key=lambda item: item.path.stem != "test_golden")
+    # Tests in Chromium are the longest: none is left for the end, when other processes are done. Golden frames compile
+    # what the hard cases need, too: of two processes the second one begins with other tests.
+    items.sort(key=lambda item: ("browser" not in item.fixturenames, item.path.stem != "test_golden"))
     for item in items:
         item.user_properties += [("atlas", "/".join(map(str, cell))) for cell in atlas.cells_of(item)]
     atlas.collected[:] = items

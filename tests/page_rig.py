@@ -29,6 +29,8 @@ from warp_ar.sources.sources import open_source
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
 
 FRAMES = 48
+RATE = 8.0
+"""Frames a second: server and browser, without a GPU, are busy with each of them while a test waits."""
 BITS, CELL = 8, 12
 """The time code: squares along the picture's bottom edge, black or white, and their side in pixels."""
 THRESHOLD = 128
@@ -78,7 +80,7 @@ def make_page_files(folder: Path) -> PageFiles:
     for index, image in enumerate(clip):
         cv2.imwrite(str(folder / "frames" / f"{index:04d}.png"), image[..., ::-1])
     files = PageFiles(folder / "scene.toml", folder / "camera.mjpeg", folder / "cache")
-    scene = dataclasses.replace(load_scene("desk"), source=SourceSpec(path=folder / "frames", fps=24.0))
+    scene = dataclasses.replace(load_scene("desk"), source=SourceSpec(path=folder / "frames", fps=RATE))
     files.scene.write_text(dumps_scene(scene))
     write_camera_file(files.camera, clip)
     with Pipeline(load_scene(files.scene), device="cpu") as pipeline:

@@ -89,7 +89,9 @@ def test_nothing_hinders_anybody(open_tab: Callable[..., Tab], artefacts: Path) 
     for size in ((1280, 800), (390, 844), (844, 390)):
         phone = min(size) < 800
         shape = {"viewport": {"width": size[0], "height": size[1]}, "has_touch": phone, "is_mobile": phone}
-        look_over(open_tab(**shape), size, phone, artefacts)
+        tab = open_tab(**shape)
+        look_over(tab, size, phone, artefacts)
+        tab.page.close()
 
 
 def look_over(tab: Tab, size: tuple[int, int], phone: bool, artefacts: Path) -> None:
@@ -116,7 +118,8 @@ def look_over(tab: Tab, size: tuple[int, int], phone: bool, artefacts: Path) -> 
             assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "wider than the screen"
             assert page.evaluate(BEYOND) == [], "wider than the panel"
             page.screenshot(path=artefacts / f"{size[0]}_{name}_{scheme}.png")
-            assert findings(page) == [], (name, scheme)
+            if size != (844, 390):  # the upright phone has the same colours, names and order
+                assert findings(page) == [], (name, scheme)
             if phone:
                 assert page.evaluate(SMALL) == [], (name, scheme)
 

@@ -265,6 +265,7 @@ DRAG_OVER = """() => {
 def refuse_a_file(tab: Tab, artefacts: Path) -> None:
     """Say so inside the window, until it is closed."""
     page = tab.page
+    tab.hold()
     assert "Drop" in page.evaluate(DRAG_OVER), "where a file may be dropped is not shown"
     tab.until("document.getElementById('notices').textContent.includes('corner.exe: expected')")
     for width, height in SIZES:
