@@ -226,7 +226,7 @@ def _maps(context: Context, case: Case, quality: Quality) -> tuple[npt.NDArray[A
 
     # A filter that reads the environment's map keeps it in the plan; the paper's own does not.
     for shown in (turn(quality, {"irradiance": "clusters"}), quality):
-        run(case, shown, context.device, keep)
+        run(case, {"": shown}, context.device, keep=keep)
     return maps["environment"], cv2.resize(maps["irradiance_map"], NORMALS[::-1], interpolation=cv2.INTER_LINEAR)
 
 
@@ -346,7 +346,7 @@ def figure_5(context: Context) -> PaperFigure:
     model = camera.copy()
     model[edges & inside] = (40, 110, 230)
     flat = turn(PRESETS["paper"], {"relight": "flat"})
-    shown = run(case, flat, context.device)[index]
+    shown = run(case, {"": flat}, context.device)[""][index]
     region = region_of(case, index, case.truth[index])
     row, columns = _profile_row(case, index, _lit_region(case, index))
     before = _luminance(case, camera)
@@ -395,12 +395,12 @@ def figure_6(context: Context) -> PaperFigure:
             line = _profile_row(case, index, _lit_region(case, index))
         row, columns = line
         shown = {"truth": truth}
-        for label, quality in {
+        qualities = {
             "alpha blending": turn(PRESETS["paper"], {"relight": "flat"}),
             "paper": PRESETS["paper"],
             "high": PRESETS["high"],
-        }.items():
-            shown[label] = run(case, quality, context.device)[index]
+        }
+        shown |= {label: own[index] for label, own in run(case, qualities, context.device).items()}
         before = _luminance(case, camera)
         physical = _band(before, row, columns)
         added = {label: _band(_luminance(case, image) - before, row, columns) for label, image in shown.items()}

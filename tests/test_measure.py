@@ -46,7 +46,7 @@ def test_frames_that_are_not_shown_keep_the_light(case, device):
     with Pipeline(case.scene, device=device, quality="low") as pipeline:
         for frame, pose in zip(case.frames, case.poses, strict=True):
             full = pipeline(frame.image, time_seconds=frame.time, pose=pose).image
-    sparse = measure.run(case, PRESETS["low"], device)
+    sparse = measure.run(case, {"": PRESETS["low"]}, device)[""]
     assert list(sparse) == [3]
     assert np.abs(sparse[3].astype(int) - full).max() <= 1
 
@@ -64,8 +64,10 @@ def test_in_turn_is_alone(case, device):
 
 @pytest.mark.slow
 def test_the_last_method_is_its_own_reference(case, device):
-    rows, pictures = measure.sweep(case, setting("mirror_ball"), device, even("mirror_ball"), base=PRESETS["low"])
-    assert [row.method for row in rows] == ["none", "single", "smooth", "brute_force"] == list(pictures)
+    one = setting("mirror_ball")
+    rows, pictures = measure.sweep(case, {one: one.methods}, device, even("mirror_ball"), base=PRESETS["low"])
+    assert [row.method for row in rows] == ["none", "single", "smooth", "brute_force"]
+    assert list(pictures) == [("mirror_ball", row.method) for row in rows]
     assert [row.milliseconds for row in rows] == [0.0, 1.0, 2.0, 3.0]
     errors = [row.error for row in rows]
     assert errors[0] > max(errors[1:])
@@ -75,7 +77,8 @@ def test_the_last_method_is_its_own_reference(case, device):
 @pytest.mark.slow
 def test_truth_is_what_pictures_are_compared_with(case, device):
     truth = dataclasses.replace(case, truth={3: np.full_like(case.frames[3].image, 250)})
-    rows, _ = measure.sweep(truth, setting("expose"), device, even("expose"), base=PRESETS["low"])
+    one = setting("expose")
+    rows, _ = measure.sweep(truth, {one: one.methods}, device, even("expose"), base=PRESETS["low"])
     assert {row.against for row in rows} == {"truth"}
     assert all(row.flip > 0.1 for row in rows)
     assert min(row.error for row in rows) == 0.0

@@ -50,7 +50,7 @@ def test_nothing_of_somebody_elses_is_overwritten(tmp_path, monkeypatch, capsys,
     arguments = ["darken", "--presets", "--frames", "1", "--shrink", "8", "--device", device, "--out", str(tmp_path)]
     (tmp_path / "presets.json").write_text("mine")
     with monkeypatch.context() as before:
-        before.setattr(tradeoff, "measure_case", no_measurement)
+        before.setattr(tradeoff, "measure_presets", no_measurement)
         assert tradeoff.main(arguments) == EXIT_FAILED
     assert "presets.json is there, and this program did not write it" in capsys.readouterr().err
     assert (tmp_path / "presets.json").read_text() == "mine"

@@ -14,17 +14,17 @@ if __name__ == "__main__":
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TimeElapsedColumn
 
 from warp_ar.accuracy import tradeoff_page
-from warp_ar.accuracy.cases import SIZED, VERSIONS, Case, open_cases
+from warp_ar.accuracy.cases import SIZED, VERSIONS, Case, open_cases, smaller
 from warp_ar.accuracy.charts import require_plots
 from warp_ar.accuracy.cost_table import SETTINGS, Setting
-from warp_ar.accuracy.measure import RUNS, measure_case, settings_of
+from warp_ar.accuracy.measure import RUNS, CaseReport, Tell, measure_methods, measure_presets, settings_of
 from warp_ar.accuracy.report import MIN_COLUMNS, make_cost_table, make_preset_list, print_report, records
 from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
 from warp_ar.device import resolve_device
@@ -32,9 +32,11 @@ from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
 from warp_ar.output.places import OwnFiles
 from warp_ar.stages.quality import PRESETS
 
-DEFAULT_FRAMES = 12
+DEFAULT_FRAMES = 999
 SETTLED = 24
 """Frames within which the light settles; shorter runs measure the errors at a recording's start."""
+METHODS_SHRINK = 2
+"""Factor by which frames are reduced where methods are measured, among them exact ones that take minutes a frame."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -52,7 +54,13 @@ def make_parser() -> argparse.ArgumentParser:
     add("--truth", type=Path, metavar="DIR", help="a case with true pictures, or a folder of cases")
     text = f"versions of the cases (default: {','.join(VERSIONS)})"
     add("--versions", type=_words, default=list(VERSIONS), metavar="A,B", help=text)
-    add("--frames", type=count, default=DEFAULT_FRAMES, metavar="N", help=f"frames per run (default: {DEFAULT_FRAMES})")
+    add(
+        "--frames",
+        type=count,
+        default=DEFAULT_FRAMES,
+        metavar="N",
+        help=f"most frames of a clip (default: {DEFAULT_FRAMES})",
+    )
     parser.add_common("--shrink", "--device")
     add("--quick", action="store_true", help="without brute force: minutes instead of hours")
     add("--processor-time", action="store_true", help="on CPU measure all threads' processor time, not clock time")
@@ -115,6 +123,21 @@ def asked_cases(options: argparse.Namespace, console: Console) -> list[tuple[Cas
     return asked
 
 
+def measure(
+    case: Case, settings: Sequence[Setting], device: str, tell: Tell, options: argparse.Namespace
+) -> Iterator[CaseReport]:
+    """Yield the report of a case's methods, if any are asked for, then that of its presets."""
+    qualities = {name: PRESETS[name] for name in options.only or RUNS}
+    if settings:
+        reduced = smaller(case, METHODS_SHRINK)
+        report, choices = measure_methods(reduced, device, settings, tell, quick=options.quick)
+        qualities |= choices
+        yield report
+    if not case.name.endswith(SIZED):
+        clock = time.process_time if options.processor_time else time.perf_counter
+        yield measure_presets(case, device, qualities, tell, quick=options.quick, clock=clock)
+
+
 def tradeoff(options: argparse.Namespace) -> int:
     """Measure, print and write the results.
 
@@ -125,7 +148,6 @@ def tradeoff(options: argparse.Namespace) -> int:
     device = resolve_device(options.device)
     if options.processor_time and not device.is_cpu:
         raise UsageError(f"--processor-time measures the CPU's time; it does not apply to {device}")
-    clock = time.process_time if options.processor_time else None
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
     names = ("tradeoff.jsonl", *(("presets.json",) if options.presets else ("cost_table.json", "tradeoff.html")))
@@ -136,20 +158,19 @@ def tradeoff(options: argparse.Namespace) -> int:
             f"after {options.frames} frames the light has not settled: better give --frames {SETTLED} or more"
         )
     reports = []
-    with Progress(console=console) as progress:
-        task = progress.add_task("", total=sum(len(settings) + (2 if settings else 1) for _, settings in asked))
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
+        task = progress.add_task("", total=len(asked))
+
+        def tell(text: str) -> None:
+            progress.update(task, description=text)
+            if not console.is_terminal:
+                console.print(text, highlight=False)
+
         for case, settings in asked:
-
-            def tell(text: str) -> None:
-                progress.update(task, advance=1, description=text)
-                if not console.is_terminal:
-                    console.print(text, highlight=False)
-
-            presets = options.only or RUNS
-            reports.append(
-                measure_case(case, str(device), settings, tell, quick=options.quick, clock=clock, presets=presets)
-            )
-            print_report(reports[-1], console)
+            for report in measure(case, settings, str(device), tell, options):
+                reports.append(report)
+                print_report(report, console)
+            progress.advance(task)
     table = make_cost_table(reports, str(device))
     for setting, methods in table["dominated"].items():
         console.print(f"dominated in every case: {setting} {', '.join(methods)}", highlight=False)

@@ -101,10 +101,8 @@ def load_case(
     if scene.source is None or scene.source.path is None:
         raise UsageError(f"scene {scene.name!r} has no clip to compare methods on; expected [source] path")
     with open_source(scene.source.path, fps=scene.source.fps) as source:
-        whole = tuple(itertools.islice(source, first, first + count))
-        width, height = source.size
-        scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(width // times, height // times))
-    frames = tuple(dataclasses.replace(frame, image=shrink(frame.image, times)) for frame in whole)
+        frames = tuple(itertools.islice(source, first, first + count))
+        scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*source.size))
     poses: tuple[Pose | None, ...] = (None,) * len(frames)
     if make_plan(Request(scene, PRESETS["reference"], (scene.camera.width, scene.camera.height))).needs("pose"):
         tracker = Tracker(scene.marker, scene.camera)
@@ -114,10 +112,20 @@ def load_case(
     for number, picture in (truth or {}).items():
         index = number - first
         if 0 <= index < len(frames):
-            complete, region = _complete(scene, whole[index].image, picture)
-            pictures[index] = shrink(complete, times)
-            regions[index] = shrink(region.astype(np.uint8) * 255, times) > 0
-    return Case(name, scene, frames, poses, pictures, regions)
+            pictures[index], regions[index] = _complete(scene, frames[index].image, picture)
+    return smaller(Case(name, scene, frames, poses, pictures, regions), times)
+
+
+def smaller(case: Case, times: int) -> Case:
+    """Return a case whose pictures are reduced by an integer factor."""
+    camera = case.scene.camera.scaled_to(case.scene.camera.width // times, case.scene.camera.height // times)
+    return dataclasses.replace(
+        case,
+        scene=dataclasses.replace(case.scene, camera=camera),
+        frames=tuple(dataclasses.replace(frame, image=shrink(frame.image, times)) for frame in case.frames),
+        truth={index: shrink(image, times) for index, image in case.truth.items()},
+        regions={index: shrink(region.astype(np.uint8) * 255, times) > 0 for index, region in case.regions.items()},
+    )
 
 
 def _complete(scene: Scene, camera: Image, truth: Image) -> tuple[Image, Mask]:

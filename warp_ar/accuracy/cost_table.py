@@ -94,7 +94,11 @@ NUMBERS = ("environment_height", "edge_samples")
 """Settings that are numbers of ``Quality``, not methods."""
 
 
-_LIGHT_ONLY = {stage.name: stage.unseen_method for stage in STAGES if stage.unseen_method} | {"edge_samples": "1"}
+_LIGHT_ONLY = {stage.name: stage.unseen_method for stage in STAGES if stage.unseen_method} | {
+    "edge_samples": "1",
+    "light_shadow": "hard",
+    "area_light": "point",
+}
 """Methods of stages without effect on the light, for frames that are not shown."""
 
 

@@ -70,12 +70,18 @@ def make_method_costs(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -
     ]
 
 
-def measure_costs(*arguments: Any, **options: Any) -> Costs:
-    """Run all steps of ``measure_steps`` and return the costs; the arguments are the same."""
+def measure_costs(*arguments: Any, tell: Callable[[float], object] = lambda share: None, **options: Any) -> Costs:
+    """Run all steps of ``measure_steps`` and return the costs.
+
+    Args:
+        arguments: Arguments of ``measure_steps``.
+        tell: Receives the completed share, 0 to 1, after each step.
+        options: Keyword arguments of ``measure_steps``.
+    """
     steps = measure_steps(*arguments, **options)
     while True:
         try:
-            next(steps)
+            tell(next(steps)[0])
         except StopIteration as end:
             return cast(Costs, end.value)
 

@@ -7,8 +7,9 @@ are FLIP, summed over the picture and divided by the number of pixels that virtu
 of all settings have one scale.
 
 **Cost of a method** is the time of its stages in excess of the setting's cheapest method, measured as by ``--quality
-auto``. Presets, and the choices of the cost table at the paper's time and error, are timed as whole frames, one frame
-of each in turn. Choices are based on the committed errors, not on the errors of the measured case.
+auto``. The command measures methods at half the size of the frames, because exact ones take minutes a frame. Presets,
+and the choices of the cost table at the paper's time and error, are timed as whole frames, one frame of each in turn.
+Choices are based on the committed errors, not on the errors of the measured case.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import dataclasses
 import math
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import TypeVar
 
 from warp_ar.accuracy.cases import SIZED, Case, Image, Mask
 from warp_ar.accuracy.cost_table import (
@@ -38,6 +40,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.stages.quality import PRESETS, Quality
 
 Clock = Callable[[], float]
+Label = TypeVar("Label", bound=Hashable)
 Tell = Callable[[str], object]
 """Function that receives a description of each finished step."""
 BASE = PRESETS["high"]
@@ -111,17 +114,10 @@ def settings_of(case: Case) -> tuple[Setting, ...]:
     return relevant_settings(case.scene, (case.scene.camera.width, case.scene.camera.height))
 
 
-def measure_case(
-    case: Case,
-    device: str,
-    settings: Sequence[Setting],
-    tell: Tell = lambda text: None,
-    *,
-    quick: bool = False,
-    clock: Clock | None = None,
-    presets: Sequence[str] = RUNS,
-) -> CaseReport:
-    """Measure every setting of a case, then presets and the best choices.
+def measure_methods(
+    case: Case, device: str, settings: Sequence[Setting], tell: Tell = lambda text: None, *, quick: bool = False
+) -> tuple[CaseReport, dict[str, Quality]]:
+    """Measure every method of some settings of a case.
 
     Args:
         case: Frames, with their truth if it is known.
@@ -129,67 +125,89 @@ def measure_case(
         settings: Settings to vary.
         tell: Receives a description of each finished step.
         quick: Whether to leave out brute force.
-        clock: Clock in seconds for whole frames; None: elapsed time.
-        presets: Presets to measure as a whole.
+
+    Returns:
+        The report, without presets, and our choices at the paper's time and at its error if all settings were varied.
     """
-    rows: list[Row] = []
-    pictures: dict[tuple[str, str], Image] = {}
-    costs = Costs(0.0, {})
-    if settings:
-        size = case.scene.camera.width, case.scene.camera.height
-        at = case.frames[-1].image, case.poses[-1]
-        costs = measure_costs(case.scene, *at, device, size, settings, all_methods=not quick)
-        tell(f"{case.name}: costs")
-    for setting in settings:
-        own, shown = sweep(case, setting, device, costs, methods=setting.measured if quick else setting.methods)
-        rows += own
-        pictures.update({(setting.name, method): image for method, image in shown.items()})
-        tell(f"{case.name}: {setting.name}")
+    size = case.scene.camera.width, case.scene.camera.height
+    shown = case.frames[-1].image, case.poses[-1]
+
+    def tell_share(share: float) -> None:
+        tell(f"{case.name}: costs, {share:.0%}")
+
+    costs = measure_costs(case.scene, *shown, device, size, settings, all_methods=not quick, tell=tell_share)
+    methods = {setting: setting.measured if quick else setting.methods for setting in settings}
+    rows, pictures = sweep(case, methods, device, costs, tell)
     index = case.shown[-1]
-    if case.name.endswith(SIZED):
-        last = pictures[settings[-1].name, rows[-1].method]
-        return CaseReport(case, {index: last}, tuple(rows), pictures, (), region_of(case, index, last))
+    reference = case.truth or {index: pictures[rows[-1].setting, rows[-1].method]}
+    report = CaseReport(case, reference, rows, pictures, (), region_of(case, index, reference[index]))
+    everything = not case.name.endswith(SIZED) and list(settings) == list(settings_of(case))
+    return report, _equals(costs, settings) if everything else {}
+
+
+def measure_presets(
+    case: Case,
+    device: str,
+    qualities: Mapping[str, Quality],
+    tell: Tell = lambda text: None,
+    *,
+    quick: bool = False,
+    clock: Clock = time.perf_counter,
+) -> CaseReport:
+    """Measure whole frames of a case at several qualities.
+
+    Args:
+        case: Frames, with their truth if it is known.
+        device: ``cpu`` or ``cuda:N``.
+        qualities: Qualities by name.
+        tell: Receives a description of each finished step.
+        quick: Whether to leave out brute force where the truth is unknown.
+        clock: Clock in seconds.
+    """
     reference = case.truth
     if not reference:
-        best = turn(PRESETS["reference"], {"environment_shadow": "bounce"}) if quick else PRESETS["reference"]
-        reference = run(case, best, device)
         tell(f"{case.name}: reference")
-    qualities = {name: PRESETS[name] for name in presets}
-    if "paper" in qualities and {setting.name for setting in settings} == {one.name for one in settings_of(case)}:
-        qualities |= _equals(costs, settings)
-    wholes = _run_wholes(case, qualities, reference, device, clock or time.perf_counter)
+        best = turn(PRESETS["reference"], {"environment_shadow": "bounce"}) if quick else PRESETS["reference"]
+        reference = run(case, {"": best}, device)[""]
     tell(f"{case.name}: presets")
-    return CaseReport(case, reference, tuple(rows), pictures, wholes, region_of(case, index, reference[index]))
+    index = case.shown[-1]
+    wholes = _run_wholes(case, qualities, reference, device, clock)
+    return CaseReport(case, reference, (), {}, wholes, region_of(case, index, reference[index]))
 
 
 def run(
-    case: Case, quality: Quality, device: str, keep: Callable[[Pipeline], object] | None = None
-) -> dict[int, Image]:
-    """Light a case's frames and return the compared pictures; other frames use cheap methods that keep the light.
+    case: Case,
+    qualities: Mapping[Label, Quality],
+    device: str,
+    tell: Tell = lambda text: None,
+    keep: Callable[[Pipeline], object] | None = None,
+) -> dict[Label, dict[int, Image]]:
+    """Light a case's frames at several qualities and return the compared pictures of each.
+
+    Frames before a compared one are lit with cheap methods that keep the light, once for all qualities of equal light.
 
     Args:
         case: Frames, with the indices of the compared ones.
-        quality: Quality of the compared pictures.
+        qualities: Qualities of the compared pictures.
         device: ``cpu`` or ``cuda:N``.
-        keep: Called with the pipeline that made the last picture.
+        tell: Receives a description of each step.
+        keep: Called with each pipeline that has made a compared picture.
     """
-    images: dict[int, Image] = {}
-    with (
-        Pipeline(case.scene, device=device, quality=quality) as pipeline,
-        Pipeline(case.scene, device=device, quality=light_only(quality)) as cheap,
-    ):
-        last: Pipeline | None = None
-        for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
-            now = pipeline if index in case.shown else cheap
-            if last not in (None, now):
-                now.continue_from(last)
-            last = now
-            result = now(frame.image, time_seconds=frame.time, pose=pose)
-            if index in case.shown:
-                images[index] = result.image
-        if keep is not None:
-            keep(pipeline)
-    return images
+    images: dict[Quality, dict[int, Image]] = {quality: {} for quality in qualities.values()}
+    for light in dict.fromkeys(map(light_only, images)):
+        own = [quality for quality in images if light_only(quality) == light]
+        tell(f"{case.name}: light of {case.shown[-1]} frames for {len(own)} qualities")
+        with Pipeline(case.scene, device=device, quality=light) as cheap:
+            for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
+                for quality in own if index in case.shown else ():
+                    with Pipeline(case.scene, device=device, quality=quality) as pipeline:
+                        pipeline.continue_from(cheap)
+                        images[quality][index] = pipeline(frame.image, time_seconds=frame.time, pose=pose).image
+                        if keep is not None:
+                            keep(pipeline)
+                if index < case.shown[-1]:
+                    cheap(frame.image, time_seconds=frame.time, pose=pose)
+    return {label: images[quality] for label, quality in qualities.items()}
 
 
 def run_in_turn(
@@ -251,26 +269,43 @@ def _equals(costs: Costs, settings: Sequence[Setting]) -> dict[str, Quality]:
 
 
 def sweep(
-    case: Case, setting: Setting, device: str, costs: Costs, *, base: Quality = BASE, methods: Sequence[str] = ()
-) -> tuple[list[Row], dict[str, Image]]:
-    """Measure every method of one setting; return a row and the last picture of each.
+    case: Case,
+    methods: Mapping[Setting, Sequence[str]],
+    device: str,
+    costs: Costs,
+    tell: Tell = lambda text: None,
+    *,
+    base: Quality = BASE,
+) -> tuple[tuple[Row, ...], dict[tuple[str, str], Image]]:
+    """Return a row and the last picture of each method of some settings.
 
     Args:
         case: Frames, with their truth if it is known.
-        setting: Setting to vary.
+        methods: Methods of each setting, in its order.
         device: ``cpu`` or ``cuda:N``.
         costs: Measured costs of the methods.
-        base: Quality of all other settings.
-        methods: Methods to measure, in the setting's order; empty means all.
+        tell: Receives a description of each step.
+        base: Quality of all settings but the varied one.
     """
     qualities = {
-        method: turn(base, {**_FAIR.get(setting.name, {}), setting.name: method})
-        for method in methods or setting.methods
+        (setting.name, method): turn(base, {**_FAIR.get(setting.name, {}), setting.name: method})
+        for setting, names in methods.items()
+        for method in names
     }
-    images = {method: run(case, quality, device) for method, quality in qualities.items()}
+    images = run(case, qualities, device, tell)
+    rows: list[Row] = []
+    for setting, names in methods.items():
+        own = {method: images[setting.name, method] for method in names}
+        rows += _rows_of(case, setting, own, costs.methods[setting.name])
+    return tuple(rows), {label: pictures[case.shown[-1]] for label, pictures in images.items()}
+
+
+def _rows_of(
+    case: Case, setting: Setting, images: Mapping[str, Mapping[int, Image]], times: Mapping[str, float]
+) -> list[Row]:
+    """Return a row for each method of a setting, from the compared pictures and the costs."""
     last = list(images.values())[-1]
     reference = case.truth or last
-    times = costs.methods[setting.name]
     errors = {method: picture_error(case, reference, own) for method, own in images.items()}
     counted = {method: error - min(errors.values()) for method, error in errors.items()}
     if setting.converges or not case.truth:
@@ -280,8 +315,7 @@ def sweep(
         Row(case.name, setting.name, method, times[method] - min(times.values()), errors[method], against, error)
         for method, error in counted.items()
     ]
-    rows = [dataclasses.replace(row, dominated=is_dominated(row, rows)) for row in rows]
-    return rows, {method: own[case.shown[-1]] for method, own in images.items()}
+    return [dataclasses.replace(row, dominated=is_dominated(row, rows)) for row in rows]
 
 
 def is_dominated(row: Row, rows: Sequence[Row]) -> bool:

@@ -73,7 +73,7 @@ def _presets(reports: Sequence[CaseReport]) -> dict[str, dict[str, dict[str, flo
 def _made(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
     """Return the conditions under which a table was made."""
     return {
-        "by": f"python -m warp_ar.tradeoff {' '.join(report.case.name for report in reports)}",
+        "by": f"python -m warp_ar.tradeoff {' '.join(dict.fromkeys(report.case.name for report in reports))}",
         "device": device_name(device),
         "warp": wp.__version__,
         "commit": commit(),
@@ -125,7 +125,8 @@ def print_report(report: CaseReport, console: Console) -> None:
         (whole.label, f"{whole.milliseconds:.2f}", f"{whole.over_paper:.2f}", f"{whole.flip:.4f}")
         for whole in report.wholes
     ]
-    print_table(console, f"{report.case.name}: as a whole", ("quality", "ms", "over paper's", "FLIP"), wholes)
+    if wholes:
+        print_table(console, f"{report.case.name}: as a whole", ("quality", "ms", "over paper's", "FLIP"), wholes)
 
 
 def print_table(

@@ -249,7 +249,8 @@ def render(reports: Sequence[CaseReport], made: Mapping[str, Any]) -> str:
     by_clock = made.get("clock", "time") == "time"
     limit = REAL_TIME if by_clock else None
     cases = {f"case{index}": report for index, report in enumerate(reports)}
-    names = {anchor: html.escape(report.case.name) for anchor, report in cases.items()}
+    kinds = {anchor: "presets" if report.wholes else "methods" for anchor, report in cases.items()}
+    names = {anchor: f"{html.escape(report.case.name)}: {kinds[anchor]}" for anchor, report in cases.items()}
     links = [f'<a href="#{anchor}">{name}</a>' for anchor, name in names.items()]
     glances = [
         f'<div class="card"><h4>{link}</h4>{_whole_chart(report, limit, SMALL)}'
