@@ -220,11 +220,11 @@ def irradiance(light, rows=None):
 
 
 def true_irradiance():
-    height = 512
+    height = 256
     rows, columns = np.meshgrid(np.arange(height) + 0.5, np.arange(2 * height) + 0.5, indexing="ij")
     light = environment_light(latlong_reference.directions(height, 2 * height, rows, columns))
     # Band by band: cosines of all texels with all directions at once are gigabytes.
-    return sum(irradiance(light, band) for band in np.split(np.arange(height), 32))
+    return sum(irradiance(light, band) for band in np.split(np.arange(height), 8))
 
 
 def captured(clip, device, exposures, quality, lit=3):
