@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import threading
 import weakref
@@ -76,7 +77,7 @@ def test_what_is_wanted_while_something_is_built_comes_next(monkeypatch: pytest.
     switcher = PipelineSwitcher(device="cpu")
     switcher.open(target())
     switcher.want(target(PAPER), lambda _: go_on.wait(60.0))
-    last = target(PRESETS["low"].with_methods(relight="flat"))
+    last = target(dataclasses.replace(LOW, environment_height=32))
     switcher.want(last)
     assert switcher.take().quality == LOW  # type: ignore[union-attr]
     go_on.set()

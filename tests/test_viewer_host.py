@@ -90,8 +90,8 @@ def test_pipelines_are_built_while_frames_flow(device: str) -> None:
     """On CUDA one thread captures and replays graphs while another allocates, uploads and loads kernels."""
     with Running(page_scene(), device=device) as running:
         running.edit(type="compare", other="paper")
-        for index in range(6):
-            running.edit(type="effect", name=("objects", "lights", "exposure")[index % 3], on=index > 2)
+        for index in range(4):
+            running.edit(type="effect", name=("objects", "lights")[index % 2], on=index > 1)
             running.edit(type="method", stage="irradiance", method=("clusters", "sh2")[index % 2])
             running.until(lambda: not running.host.state_message()["building"])
             assert running.next().image.any()
@@ -243,7 +243,7 @@ def test_a_pixel_names_the_object_behind_one_that_moves_in_parts(tmp_path: Path)
     path = moving().save(tmp_path / "a.glb")
     parts = Object("mesh", file=path, scale=0.01, at=(0.1, 0.1, 0.02), play=Play("go"))
     ball = Object("sphere", radius=0.03, at=(-0.05, 0.0, 0.03))
-    with Running(page_scene(objects=(parts, ball))) as running:
+    with Running(page_scene(objects=(parts, ball)), quality="paper") as running:
         lit = running.next()
         center = lit.pose.apply(np.array([ball.at]))[0]
         x, y = (lit.camera.matrix() @ (center / center[2]))[:2]
