@@ -31,15 +31,15 @@ class Grain:
     """Samples of the environment for ambient visibility."""
     ambient: int
     """Pixels per cell of ambient visibility, in frames of ``STRIDE_ROWS`` rows; 1: a cell per pixel of any frame."""
-    bounced: int
+    bounced: int = 1
     """Pixels per cell of bounced light, likewise."""
-    patch: int
+    patch: int = 1
     """Pixels per patch that reflects bounced light, likewise."""
 
 
 GRAINS: Mapping[str, Grain] = MappingProxyType(
     {
-        "reflectance": Grain(64, 8, 8, 16),
+        "reflectance": Grain(64, 8),
         "bounce": Grain(128, 4, 8, 16),
         "brute_force": Grain(SAMPLES, 1, 1, 4),
     }
