@@ -266,7 +266,7 @@ def test_a_certificate_that_is_none_is_one_line(tmp_path):
         ("pipe.pem", "is a named pipe; a regular file is needed"),
         ("none.pem", "is not there"),
         ("text.pem", "expected a PEM file with a certificate and its key"),
-        ("locked.pem", "its key asks for a password; expected a PEM file"),
+        ("locked.pem", "expected a PEM file with a certificate and its key without a password"),
     ):
         with pytest.raises(UsageError, match=rf"--tls .*{name}:? .*{words}"):
             load_context(tmp_path / name)

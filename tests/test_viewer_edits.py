@@ -12,7 +12,7 @@ import pytest
 
 from tests.viewer_rig import SIZE, page_scene
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.scene import Exposure, Light, MirrorMaterial, PhongMaterial, bundled_scenes, load_scene
+from warp_ar.scene import Exposure, Light, MirrorMaterial, PhongMaterial, Proxy, bundled_scenes, load_scene
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.card_layout import CARD_MARKER
@@ -133,8 +133,7 @@ def test_what_can_be_added_can_be_read_back(part: str, kind: str) -> None:
     for _ in range(edits.MOST_PARTS):
         with contextlib.suppress(UsageError):
             scene = edits.add_part(scene, part, kind)
-    lists = {"object": scene.objects, "light": scene.lights, "proxy": scene.proxies}
-    assert len(lists[part]) == edits.MOST_PARTS
+    assert len({"object": scene.objects, "light": scene.lights}[part]) == edits.MOST_PARTS
 
 
 def test_the_printed_card_is_used_with_the_sizes_that_were_typed() -> None:
@@ -149,7 +148,7 @@ def test_the_printed_card_is_used_with_the_sizes_that_were_typed() -> None:
     assert any(proxy.shape == "plane" for proxy in used.proxies)
     # Boxes stood around the marker of before; those that were pointed out beside the card stay.
     assert not any(proxy.shape == "box" for proxy in edits.use_card(load_scene("desk"), 0.031, 0.1).proxies)
-    with_box = edits.add_part(used, "proxy", "box")
+    with_box = edits.add_item(used, "proxy", Proxy("box", size=(0.06, 0.06, 0.06)))
     assert edits.use_card(with_box, 0.031, 0.098).proxies == with_box.proxies
     own = edits.set_value(used, "marker", 0, "size", 0.05)
     assert own.marker.board is None

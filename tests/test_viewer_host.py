@@ -137,7 +137,7 @@ def test_a_bad_edit_changes_nothing_and_says_why(running: Running) -> None:
     "edit",
     [
         {"part": "marker", "index": 0, "key": "size", "value": 80},
-        {"part": "probe", "index": 0, "key": "radius", "value": 1e-9},
+        {"part": "object", "index": 0, "key": "scale", "value": 1e-9},
     ],
 )
 def test_an_edit_that_a_scene_file_may_have_never_ends_the_frames(running: Running, edit: dict[str, Any]) -> None:

@@ -42,7 +42,7 @@ def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
         ('{"type": "ack", "id": 1, "more": 1}', "ack takes id"),
         ('{"type": "ack", "id": -1}', "ack: id"),
         ('{"type": "ack", "id": 1e3}', "ack: id"),
-        ('{"type": "ping", "sent": NaN}', "NaN is no number"),
+        ('{"type": "ping", "sent": NaN}', "ping: sent"),
         ('{"type": "set", "part": "camera", "index": 0, "key": "fx", "value": 1}', "set: part"),
         ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, 3, 4]}', "set: value"),
         ('{"type": "add", "part": "object", "kind": "mesh"}', "add: kind"),

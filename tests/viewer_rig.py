@@ -60,7 +60,6 @@ GOOD = [
     {"type": "snap", "index": 0},
     {"type": "undo"},
     {"type": "redo"},
-    {"type": "add", "part": "proxy", "kind": "plane"},
     {"type": "outline", "kind": "wall", "points": [[1, 2], [3, 4], [5, 6.5], [7, 8]]},
     {"type": "card", "radius": 0.03, "ruler": 0.097},
     {"type": "setup", "step": "check"},

@@ -24,18 +24,12 @@ def load_context(path: Path) -> ssl.SSLContext:
         UsageError: The file is not a regular file, holds no certificate with its key, or the key has a password.
     """
     read_bytes(path, "text_bytes", UsageError, f"--tls {path}")  # refuses a pipe, which would block
-    asked = []
-
-    def password() -> str:
-        asked.append(True)
-        return ""  # without this function OpenSSL would prompt on the terminal
-
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
-        context.load_cert_chain(path, password=password)
+        context.load_cert_chain(path, password="")  # otherwise OpenSSL would prompt on the terminal
     except OSError as error:  # ssl.SSLError is one
-        words = "its key asks for a password" if asked else str(error)
-        raise UsageError(f"--tls {path}: {words}; expected a PEM file with a certificate and its key") from error
+        words = "expected a PEM file with a certificate and its key without a password"
+        raise UsageError(f"--tls {path}: {error}; {words}") from error
     return context
 
 

@@ -77,12 +77,10 @@ def play_record(item: Object) -> dict[str, Any]:
     names = names_of(item)
     if not names:
         return {}
-    play = item.play
-    if play is None:
-        return {"animations": names, "animation": NONE, "speed": Play.speed, "loop": Play.loop, "paused": False}
+    play = item.play or Play()
     number = names.index(play.animation) if isinstance(play.animation, str) else play.animation
-    shown = {"speed": play.speed, "loop": play.loop, "paused": play.paused}
-    return {"animations": names, "animation": number, **shown}
+    number = NONE if item.play is None else number
+    return {"animations": names, "animation": number, "speed": play.speed, "loop": play.loop, "paused": play.paused}
 
 
 def set_play(item: Object, key: str, value: float, seconds: float) -> Object:
@@ -129,12 +127,11 @@ _KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "object": ("at", "rotate", "scale", "radius", "size", "major_radius", "minor_radius"),
     "light": ("at", "target", "direction", "color", "intensity", "inner_angle", "outer_angle", "radius"),
     "proxy": ("at", "rotate", "size"),
-    "probe": ("center", "radius", "reflectance"),
     "exposure": ("scale",),
     "marker": ("dictionary", "id", "size"),
     "material": ("base_color", "diffuse", "specular", "shininess", "metallic", "roughness", "color", "intensity"),
 }
-_NEW: Final[Mapping[tuple[str, str], Object | Light | Proxy]] = {
+_NEW: Final[Mapping[tuple[str, str], Object | Light]] = {
     ("object", "sphere"): Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
     ("object", "box"): Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
     ("object", "torus"): Object(
@@ -149,8 +146,6 @@ _NEW: Final[Mapping[tuple[str, str], Object | Light | Proxy]] = {
         "spot", 1.0, at=(0.0, -0.1, 0.35), target=(0.05, 0.05, 0.0), inner_angle=12.0, outer_angle=20.0
     ),
     ("light", "directional"): Light("directional", 0.6, direction=(0.4, 0.5, -1.0)),
-    ("proxy", "plane"): Proxy("plane", size=(0.2, 0.15)),
-    ("proxy", "box"): Proxy("box", at=(0.12, -0.08, 0.03), size=(0.06, 0.06, 0.06)),
 }
 
 
@@ -226,7 +221,7 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
 
     Args:
         scene: The scene.
-        part: ``object``, ``light``, ``proxy``, ``probe``, ``exposure`` or ``marker``.
+        part: ``object``, ``light``, ``proxy``, ``exposure`` or ``marker``.
         index: Number of the part.
         key: Key of the part's section in a scene file, or of its material.
         value: A number, a tuple of numbers or a word.
@@ -282,7 +277,7 @@ def _material(material: Material, key: str, value: Any) -> Material:
 
 
 def add_part(scene: Scene, part: str, kind: str) -> Scene:
-    """Return the scene with a new object, light or proxy of ``kind``."""
+    """Return the scene with a new object or light of ``kind``."""
     return add_item(scene, part, _NEW[part, kind])
 
 
@@ -333,6 +328,10 @@ class Wanted:
     def camera_of(self, size: tuple[int, int]) -> Camera | None:
         """Return the calibrated camera for frames of a size, (width, height); None if none was calibrated."""
         return next((camera for camera in self.cameras if (camera.width, camera.height) == size), None)
+
+    def with_scene(self, **changes: Any) -> Wanted:
+        """Return this state with fields of its scene replaced."""
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, **changes))
 
     def with_camera(self, camera: Camera) -> Wanted:
         """Return this state with a calibrated camera for frames of the camera's size."""
@@ -412,7 +411,7 @@ def make_edit(command: Command, original: Wanted, seconds: float = 0.0) -> tuple
     """
     fields = command.fields
     part, index, key, on = (fields.get(name) for name in ("part", "index", "key", "on"))
-    names = {None: "object", "object": "object", "light": "light", "proxy": "shape", "probe": "mirror ball"}
+    names = {None: "object", "object": "object", "light": "light", "proxy": "shape"}
     words = f"{names[part]} {(index or 0) + 1}" if part in names else f"the {part}"
 
     def of_scene(change: Callable[..., Scene], *more: Any) -> Edit:
@@ -462,9 +461,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 
     def plain(item: Any) -> dict[str, Any]:
         fields = {key: value.name if isinstance(value, Path) else value for key, value in vars(item).items()}
-        return {
-            key: value for key, value in fields.items() if isinstance(value, str | int | float | tuple) or value is None
-        }
+        return {key: value for key, value in fields.items() if isinstance(value, str | int | float | tuple | None)}
 
     def part(kind: str, index: int, item: Any) -> dict[str, Any]:
         record = {**plain(item), "visible": (kind, index) not in wanted.hidden}
@@ -479,16 +476,11 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
     marker, ruler = scene.marker, card_ruler(scene)
     return {
         "name": scene.name,
-        "objects": [part("object", i, item) for i, item in enumerate(scene.objects)],
-        "lights": [part("light", i, item) for i, item in enumerate(scene.lights)],
-        "proxies": [part("proxy", i, item) for i, item in enumerate(scene.proxies)],
-        "probes": [plain(item) for item in scene.probes],
+        **{name: [part(kind, *one) for one in enumerate(getattr(scene, name))] for kind, name in _LISTS.items()},
         "captured": None if scene.captured is None else scene.captured.file.name,
         "exposure": scene.exposure.scale,
         "marker": {
-            "dictionary": marker.dictionary,
-            "id": marker.id,
-            "size": marker.size,
+            **plain(marker),
             "board": None if marker.board is None else str(marker.board),
             "ruler": None if ruler is None else round(ruler, 6),
         },

@@ -36,16 +36,16 @@ LARGEST_CAMERA: Final = (1920, 1080)
 
 EFFECTS: Final = ("objects", "lights", "environment", "receiver", "exposure", "relief", "environment_shadow")
 """Effects that the page can switch off."""
-PARTS: Final = ("object", "light", "proxy", "probe", "exposure", "marker")
+PARTS: Final = ("object", "light", "proxy", "exposure", "marker")
 """Parts of a scene that the page can edit."""
 ANIMATED: Final = ("animation", "speed", "loop", "paused")
 """Values of an object's animation that the page can change."""
 KINDS: Final = {
     "object": ("sphere", "box", "torus"),
     "light": ("point", "spot", "directional"),
-    "proxy": ("plane", "box"),
+    "proxy": (),
 }
-"""Kinds of each part that the page can add. Meshes are files, and the page names no file."""
+"""Kinds of each part that the page can add. Meshes are files, which the page drops; proxies are outlined."""
 OUTLINES: Final = ("plane", "wall", "box")
 """Kinds of proxies that can be outlined by four points of the picture."""
 SETUP_STEPS: Final = ("check", "ball", "light", "response")
@@ -97,10 +97,6 @@ def _number(low: float, high: float, kind: type = float) -> Check:
     return check
 
 
-def _integer(low: int, high: int) -> Check:
-    return _number(low, high, int)
-
-
 def _choice(*options: str) -> Check:
     def check(value: Any) -> str:
         _expect(isinstance(value, str) and value in options, f"one of {', '.join(options)}")
@@ -141,13 +137,13 @@ def _points(value: Any) -> tuple[tuple[float, float], ...]:
     return tuple((check(x), check(y)) for x, y in value)
 
 
-_INDEX = _integer(0, 63)
+_INDEX = _number(0, 63, int)
 _NAME = {"name": _name}
 _ON = {"on": _flag}
 
 _MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
     # Acknowledges that the frame of this number is on the screen.
-    "ack": {"id": _integer(0, 1 << 53)},
+    "ack": {"id": _number(0, 1 << 53, int)},
     # Requests the server's clock; the answer repeats ``sent``.
     "ping": {"sent": _number(0.0, 1e15)},
     # Requests the object at a pixel, or nearest to it within ``reach`` pixels; the answer repeats the arguments.
@@ -184,17 +180,13 @@ _MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
     "reset": {},
     # Makes the camera of the page's browser the source; binary messages with its pictures follow.
     "camera": {
-        "width": _integer(SMALLEST_CAMERA[0], LARGEST_CAMERA[0]),
-        "height": _integer(SMALLEST_CAMERA[1], LARGEST_CAMERA[0]),
+        "width": _number(SMALLEST_CAMERA[0], LARGEST_CAMERA[0], int),
+        "height": _number(SMALLEST_CAMERA[1], LARGEST_CAMERA[0], int),
     },
     "no_camera": {},
     # Starts to collect views of the printed board, stops without a result, or computes the camera from the views.
     "calibrate": {"step": _choice("start", "stop", "finish")},
 }
-
-
-def _refuse_constant(name: str) -> Any:
-    raise ProtocolError(f"{name} is no number")
 
 
 def parse_text(text: str) -> Command:
@@ -206,10 +198,8 @@ def parse_text(text: str) -> Command:
     if len(text) > MAX_TEXT:
         raise ProtocolError(f"text message of {len(text)} characters; {MAX_TEXT} at most")
     try:
-        message = json.loads(text, parse_constant=_refuse_constant)
+        message = json.loads(text)  # NaN and infinities are in no range of the checks
     except (ValueError, RecursionError) as error:
-        if isinstance(error, ProtocolError):
-            raise
         raise ProtocolError("text message is no JSON") from error
     kind = message.get("type") if isinstance(message, dict) else None
     if not isinstance(kind, str) or kind not in _MESSAGES:

@@ -29,7 +29,6 @@ from warp_ar.scene import Camera, CapturedLight, Pose, Scene
 from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.tracking.tracking import TrackState
 from warp_ar.viewer.controls import Controls, Feed, Image
-from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.light_record import written
 from warp_ar.viewer.protocol import Notify, begin, failure
 
@@ -313,12 +312,7 @@ class SetupChecks:
             )
         x, y, z = (round(value, 5) for value in found.center)
         ball = dataclasses.replace(probe, center=(x, y, z), radius=round(found.radius, 5))
-
-        def change(wanted: Wanted) -> Wanted:
-            balls = (ball, *wanted.scene.probes[1:])
-            return dataclasses.replace(wanted, scene=dataclasses.replace(wanted.scene, probes=balls))
-
-        self._controls.change(change, "measure the ball")
+        self._controls.change(lambda w: w.with_scene(probes=(ball, *w.scene.probes[1:])), "measure the ball")
         moved = 1e3 * math.dist(found.center, probe.center)
         unsure = " as typed (the views are too similar to measure it: move the camera around)"
         radius = unsure if found.radius_deviation is None else f" ± {2e3 * found.radius_deviation:.1f} mm"
@@ -335,10 +329,7 @@ class SetupChecks:
         path = self._path.with_name(f"card_light_{self._count}.exr")
         write_environment(path, found.latlong)
         captured = CapturedLight(path)
-        self._controls.change(
-            lambda w: dataclasses.replace(w, scene=dataclasses.replace(w.scene, captured=captured)),
-            "light by the card",
-        )
+        self._controls.change(lambda w: w.with_scene(captured=captured), "light by the card")
         return found.words
 
     def _response(self, scene: Scene, look: Look) -> str:

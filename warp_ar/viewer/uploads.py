@@ -271,11 +271,7 @@ def _light_edit(name: str, path: Path) -> Edit:
     captured = CapturedLight(path)
     height, width = light.radiance.shape[:2]
     words = f"{name}: its light ({width}x{height} texels) replaces the mirror ball's. Undo restores that."
-    return (
-        lambda w: dataclasses.replace(w, scene=dataclasses.replace(w.scene, captured=captured)),
-        f"light by {name}",
-        words,
-    )
+    return lambda w: w.with_scene(captured=captured), f"light by {name}", words
 
 
 def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
