@@ -113,7 +113,7 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
         # The same camera, come back, is known.
         running.edit(type="no_camera")
         running.edit(type="camera", width=size[0], height=size[1])
-        assert not running.host.state_message()["estimating"]
+        running.until(lambda: running.host.state_message()["lens"] == "calibrated")
         # What was calibrated can be undone.
         running.edit(type="undo")
         running.until(lambda: running.host.state_message()["lens"] != "calibrated")

@@ -127,7 +127,7 @@ def test_a_bad_edit_changes_nothing_and_says_why(running: Running) -> None:
         running.edit(type="quality", name="best")
     with pytest.raises(UsageError, match="bundled"):
         running.edit(type="scene", name="../secret")
-    with pytest.raises(UsageError, match="preset"):
+    with pytest.raises(ProtocolError, match="paper"):
         running.edit(type="compare", other="nothing")
     assert running.host.wanted() == before
     running.next()

@@ -86,11 +86,13 @@ async def test_downloads() -> None:
         await page.until("frame")
         while not (await page.until("light"))[0]["known"]:
             pass
-        for name, start in [("frame.png", b"\x89PNG"), ("environment.exr", b"v/1\x01"), ("scene.toml", b"schema = 1")]:
+        for name, start in [("frame.png", b"\x89PNG"), ("scene.toml", b"schema = 1")]:
             async with site.session.get(f"{site.url}/download/{name}") as response:
                 assert response.status == 200
                 assert name in response.headers["Content-Disposition"]
                 assert (await response.read()).startswith(start)
+        async with site.session.get(f"{site.url}/light.exr?&axes=z-up") as response:
+            assert (await response.read()).startswith(b"v/1\x01")
         async with site.session.get(f"{site.url}/download/camera.yml") as response:
             assert response.status == 409
 

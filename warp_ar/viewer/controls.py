@@ -25,7 +25,6 @@ from warp_ar.pictures import decode_picture
 from warp_ar.scene import Camera, Scene
 from warp_ar.sources.source import Frame, Source
 from warp_ar.sources.sources import MOST_INDEX, QueueSource, open_scene_source, source_of
-from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
 from warp_ar.viewer.edits import Wanted, wanted_record
 from warp_ar.viewer.protocol import Notify
@@ -124,10 +123,6 @@ class NoCamera(Source):
 
 CAMERA: Final = "camera"
 """Name of a comparison with the camera's picture."""
-TRACED: Final = "traced"
-DIFFERENCE: Final = "difference"
-CONVERGING: Final = (TRACED, DIFFERENCE)
-"""Comparisons of a held frame: with the reference, or with the difference to the reference in false colours."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -189,7 +184,7 @@ class Controls:
         self.wanted = wanted
         """State that viewers see, at the latest once its pipeline is built."""
         self.compare = ""
-        """Picture to compare with: empty for none, ``CAMERA``, one of ``CONVERGING``, or a preset."""
+        """Picture to compare with: empty for none, ``CAMERA``, one of ``protocol.CONVERGING``, or a preset."""
         self.playing = True
         self.watchers = 0
         """Number of viewers; frames are lit only while there is one."""
@@ -277,14 +272,7 @@ class Controls:
         self.changed.notify_all()
 
     def set_compare(self, other: str) -> None:
-        """Choose the picture to compare with.
-
-        Raises:
-            UsageError: ``other`` is not a known comparison.
-        """
-        if other not in ("", CAMERA, *CONVERGING, *PRESETS):
-            known = ", ".join((CAMERA, *CONVERGING))
-            raise UsageError(f"compare with {other!r}; expected {known} or a preset: {', '.join(PRESETS)}")
+        """Choose the picture to compare with."""
         with self.changed:
             self.compare = other
             self._touch()

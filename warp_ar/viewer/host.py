@@ -28,7 +28,6 @@ from warp_ar.tracking.tracking import TrackState, given_pose, tell_missing_poses
 from warp_ar.viewer import edits
 from warp_ar.viewer.budget import START, BudgetSetting
 from warp_ar.viewer.controls import (
-    CONVERGING,
     BrowserCamera,
     Controls,
     Feed,
@@ -39,9 +38,9 @@ from warp_ar.viewer.controls import (
     open_feed,
 )
 from warp_ar.viewer.edits import Wanted
-from warp_ar.viewer.light_record import LightState, encode_picture
+from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Convergence, Lighting, make_target
-from warp_ar.viewer.protocol import Command, Notify, failure, notice
+from warp_ar.viewer.protocol import CONVERGING, Command, Notify, failure, notice
 from warp_ar.viewer.setup import CalibrationSession, SetupChecks, card_pdf, page_record
 from warp_ar.viewer.uploads import DroppedFiles, pack_scene
 
@@ -304,7 +303,6 @@ class Host:
         """
         return {
             "frame.png": ("image/png", self.snapshot),
-            "environment.exr": ("image/x-exr", self.environment_exr),
             "scene.toml": ("application/toml", lambda: self.scene_toml(full_paths=full_paths).encode()),
             "scene.zip": (
                 "application/zip",
@@ -325,18 +323,6 @@ class Host:
         if (latest := self.latest) is None:
             raise UsageError("no frame has been lit yet")
         return encode_png(latest.image)
-
-    def environment_exr(self) -> bytes:
-        """Return the environment as an EXR.
-
-        Raises:
-            UsageError: The environment is not known.
-        """
-        if (state := self.light_state) is None:
-            raise UsageError(
-                "the environment is not captured: no stage of this scene reads it, or the marker was not seen"
-            )
-        return encode_picture(state, "exr", "z-up", "latlong", None)
 
     def scene_toml(self, *, full_paths: bool) -> str:
         """Return the shown scene as the text of a scene file.
@@ -372,7 +358,6 @@ class Host:
             "fps": round(self.fps, 2),
             "source": self.description,
             "camera": controls.feed.is_browser,
-            "estimating": self._setup.estimating,
             "lens": self._lens(),
             "missing": self._missing(),
             "ball": self._setup.ball,

@@ -31,7 +31,7 @@ from warp_ar.stages import STAGES
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 from warp_ar.tracking.tracking import given_pose
-from warp_ar.viewer.controls import CAMERA, TRACED, Controls, Feed, Image
+from warp_ar.viewer.controls import CAMERA, Controls, Feed, Image
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.protocol import Notify, failure, notice
 
@@ -396,7 +396,7 @@ class Convergence:
         picture, lit = self._picture, self._lit
         if key != self._key or picture is None or lit is None:
             return None
-        return picture.image if compare == TRACED else false_colors(lit, picture.image)
+        return picture.image if compare == "traced" else false_colors(lit, picture.image)
 
     def _told(self, picture: TracedPicture, lit: Image) -> dict[str, float]:
         """Return the status for viewers: samples per pixel, and errors and differences in per cent."""

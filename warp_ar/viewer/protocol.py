@@ -24,6 +24,7 @@ from typing import Any, Final
 
 from warp_ar.errors import WarpArError, reason
 from warp_ar.pictures import picture_size
+from warp_ar.stages.quality import PRESETS
 
 MAX_TEXT: Final = 4096
 """Longest text message from a page in bytes: an edit takes under 200."""
@@ -36,6 +37,8 @@ LARGEST_CAMERA: Final = (1920, 1080)
 
 EFFECTS: Final = ("objects", "lights", "environment", "receiver", "exposure", "relief", "environment_shadow")
 """Effects that the page can switch off."""
+CONVERGING: Final = ("traced", "difference")
+"""Comparisons of a held frame: with the reference, or with the difference to the reference in false colours."""
 PARTS: Final = ("object", "light", "proxy", "exposure", "marker")
 """Parts of a scene that the page can edit."""
 ANIMATED: Final = ("animation", "speed", "loop", "paused")
@@ -166,7 +169,7 @@ _MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
     # Sets the budget, milliseconds per frame; null returns to a preset.
     "budget": {"ms": _optional(_number(1.0, 10000.0))},
     # Chooses the picture to compare with: none, the camera's frame, a preset, or the reference.
-    "compare": {"other": _name},
+    "compare": {"other": _choice("", "camera", *CONVERGING, *PRESETS)},
     # Plays frames, or holds the present one.
     "play": _ON,
     "scene": _NAME,

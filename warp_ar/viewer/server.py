@@ -645,15 +645,11 @@ def _axes(request: web.Request) -> str:
 
 def _numbers(request: web.Request) -> dict[str, Any]:
     """Return the keys ``size`` (texels; None if not given) and ``ball`` (index of a mirror ball) of a request."""
-    expected = {
-        "size": (1, LARGEST_FACE, f"1 to {LARGEST_FACE} texels"),
-        "ball": (0, 999, "the number of a mirror ball, counted from 0"),
-    }
     numbers: dict[str, Any] = {"size": None, "ball": 0}
-    for name, (least, most, words) in expected.items():
+    for name, least, most in (("size", 1, LARGEST_FACE), ("ball", 0, 999)):
         if (text := request.query.get(name)) is not None:
             if not (text.isascii() and text.isdigit() and len(text) < 6 and least <= int(text) <= most):
-                raise web.HTTPBadRequest(text=f"{name} = {text[:40]!r}: expected {words}\n")
+                raise web.HTTPBadRequest(text=f"{name} = {text[:40]!r}: expected {least} to {most}\n")
             numbers[name] = int(text)
     return numbers
 

@@ -228,11 +228,6 @@ class SetupChecks:
         feed = self._controls.feed
         return feed.is_browser and self._controls.wanted.camera_of(feed.source.size) is None
 
-    @property
-    def estimating(self) -> bool:
-        """True while the focal length of a browser's camera is only guessed."""
-        return self._guesses and not self._controls.feed.estimated
-
     def _estimate_focal(self, feed: Feed) -> None:
         with contextlib.suppress(WarpArError):  # the source has changed meanwhile
             scene, camera = self._shown()

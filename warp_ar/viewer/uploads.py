@@ -39,8 +39,6 @@ _KINDS: Final = {*MESH_SUFFIXES, ".mtl", ".bin", ".exr", ".hdr", ".txt", ".json"
 """Endings of files that a scene may name."""
 LONGEST_NAME: Final = 200
 """Largest number of characters of a ZIP member's path."""
-MOST_LEVELS: Final = 8
-"""Largest number of nested folders in a ZIP member's path."""
 _T = TypeVar("_T")
 
 
@@ -111,15 +109,12 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
         raise UsageError(f"{name} unpacks to {_megabytes(size)}; at most {_megabytes(most)} are taken")
     for inside in names:
         parts = PurePosixPath(inside)
-        if len(inside) > LONGEST_NAME or len(parts.parts) > MOST_LEVELS + 1:
-            limits = f"at most {LONGEST_NAME} characters and {MOST_LEVELS} folders within each other are taken"
-            raise UsageError(f"{name}: {_shown(inside)} ... has {len(inside)} characters; {limits}")
+        if len(inside) > LONGEST_NAME:
+            limit = f"at most {LONGEST_NAME} are taken"
+            raise UsageError(f"{name}: {_shown(inside)} ... has {len(inside)} characters; {limit}")
         plain = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", inside) and ".." not in parts.parts
         if not plain or (inside != SCENE and parts.suffix.lower() not in _KINDS):
             raise UsageError(f"{name}: {_shown(inside)} is no file that a scene may name")
-    folders = {str(folder) for inside in names for folder in PurePosixPath(inside).parents}
-    if both := folders.intersection(names):
-        raise UsageError(f"{name}: {_shown(min(both))} is a file and a folder")
 
 
 def _packed_path(name: str) -> str:

@@ -4,7 +4,7 @@ import { Capture } from "./capture.js";
 import { cameraOf, poseOf, project } from "./geometry.js";
 import { Handles } from "./handles.js";
 import { Light } from "./light.js";
-import { Connection, downloadUrl, dropFile } from "./net.js";
+import { Connection, downloadUrl, dropFile, lightUrl } from "./net.js";
 import { QualityPanel, ScenePanel, TimePanel } from "./panels.js";
 import { Pointing } from "./pointing.js";
 import { SetupPanel } from "./setup.js";
@@ -285,7 +285,7 @@ function showBuilding() {
 function showCamera() {
   if (!camera) return;
   const field = (2 * Math.atan((0.5 * camera.width) / camera.fx) * 180) / Math.PI;
-  const guess = state.estimating ? " Still being estimated: show the marker from several sides." : "";
+  const guess = state.camera && state.lens === "guessed" ? " Still being estimated: show the marker from several sides." : "";
   $("camera-note").textContent = `${state.source}. ${camera.width}×${camera.height}, focal length ${camera.fx.toFixed(0)} pixels (${field.toFixed(0)}° across).${guess}`;
 }
 
@@ -293,6 +293,7 @@ for (const link of document.querySelectorAll("[data-download]")) {
   link.href = downloadUrl(link.dataset.download);
   link.download = link.dataset.download;
 }
+for (const link of document.querySelectorAll("[data-light]")) link.href = lightUrl;
 for (const menu of document.querySelectorAll(".menu")) {
   menu.addEventListener("click", (event) => event.target.closest("a, div > button") && (menu.open = false));
   menu.addEventListener("keydown", (event) => event.key === "Escape" && ((menu.open = false), menu.firstElementChild.focus()));

@@ -7,6 +7,7 @@ const query = token ? `?token=${encodeURIComponent(token)}` : "";
 const DRIFT = 1e-3;
 
 export const codeUrl = `address.svg${query}`;
+export const lightUrl = `light.exr${query || "?"}&axes=z-up`;
 export const downloadUrl = (name) => `download/${name}${query}`;
 
 /** Hand the program a file; whether it took it, and what it says. */
