@@ -33,7 +33,7 @@ RECORDINGS = """
 schema = 1
 [run]
 quality = "low"
-segment_frames = 3
+segment_frames = 6
 [[clip]]
 scene = "torus"
 path = "good.mp4"
@@ -127,7 +127,7 @@ def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder, finished, 
     assert not (run / "cut.mp4").exists()
     assert list((run / "parts").iterdir()) == [], "what was joined is not kept twice"
     status = read_status(run)
-    assert status["done"] == {"survey": 1, "segment": 4, "join": 1}
+    assert status["done"] == {"survey": 1, "segment": 2, "join": 1}
     assert not status["running"]
     capsys.readouterr()
     assert main(["status", str(run)]) == 0

@@ -54,7 +54,7 @@ def test_frames_that_are_not_shown_keep_the_light(case, device):
 @pytest.mark.slow
 def test_in_turn_is_alone(case, device):
     """Qualities that run in turn do not touch each other."""
-    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="sh2")}
+    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="brute_force")}
     times, images = measure.run_in_turn(case, qualities, device, time.perf_counter)
     for label, quality in qualities.items():
         _, alone = measure.run_in_turn(case, {label: quality}, device, time.perf_counter)

@@ -136,7 +136,7 @@ def encodable(text: str) -> bool:
     return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_what_is_written_loads_as_it_was(folder: pathlib.Path, data: st.DataObject) -> None:
     scene = data.draw(scenes(folder.resolve()))
