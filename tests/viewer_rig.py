@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from typing import Any
+from unittest import mock
 
 import aiohttp
 import cv2
@@ -23,6 +24,7 @@ from tests.test_pipeline import make_scene
 from warp_ar.calibration.card import card_size, draw_card
 from warp_ar.scene import Camera, Marker, Scene, SourceSpec
 from warp_ar.scene.pixel_rays import pixel_rays
+from warp_ar.sources import sources
 from warp_ar.viewer.address import Address
 from warp_ar.viewer.gate import HEADER_SECONDS
 from warp_ar.viewer.host import Host, Lit
@@ -31,6 +33,11 @@ from warp_ar.viewer.server import Server, encode_jpeg
 
 SIZE = (320, 240)
 PATIENCE = 180.0  # seconds that anything may take on a busy machine
+
+
+def small_frames() -> contextlib.AbstractContextManager[Any]:
+    """Let generated clips have ``SIZE``, a quarter of their usual pixels, all of which are lit while a test waits."""
+    return mock.patch.object(sources, "Synthetic", functools.partial(sources.Synthetic, size=SIZE))
 
 
 def page_scene(**changes: Any) -> Scene:
@@ -133,7 +140,10 @@ class Running:
         self.frames: list[Lit] = []
         self.messages: list[dict[str, Any]] = []
         options = {"quality": "low", "device": "cpu", **options}
-        self.host = Host(scene, publish=self.frames.append, notify=self.messages.append, **options)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(small_frames())
+            self.host = Host(scene, publish=self.frames.append, notify=self.messages.append, **options)
+            self._sources = stack.pop_all()
         self.thread = threading.Thread(target=self.host.run)
 
     def __enter__(self) -> Running:
@@ -152,6 +162,7 @@ class Running:
         self.thread.join(PATIENCE)
         assert not self.thread.is_alive()
         self.host.close()
+        self._sources.close()
 
     def until(self, condition: Any) -> Any:
         deadline = time.monotonic() + PATIENCE
@@ -233,21 +244,22 @@ async def served(
     ready: asyncio.Event = asyncio.Event()
     make = functools.partial(Host, scene or page_scene(), device="cpu", quality="low")
     server = Server(make, Address(port=0, **address), header_seconds=header_seconds)
-    task = asyncio.create_task(server.serve(lambda _: ready.set()))
-    waiting = asyncio.create_task(ready.wait())
-    await asyncio.wait({task, waiting}, return_when=asyncio.FIRST_COMPLETED)
-    assert ready.is_set(), task.exception()
-    try:
-        async with aiohttp.ClientSession() as session:
-            yield Site(server, f"http://127.0.0.1:{server.address.port}", session)
-    finally:
-        # A host that is made after its server has stopped waiting for it is closed by nobody.
-        made = asyncio.create_task(server.started())
-        await asyncio.wait({task, made}, timeout=PATIENCE, return_when=asyncio.FIRST_COMPLETED)
-        made.cancel()
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+    with small_frames():
+        task = asyncio.create_task(server.serve(lambda _: ready.set()))
+        waiting = asyncio.create_task(ready.wait())
+        await asyncio.wait({task, waiting}, return_when=asyncio.FIRST_COMPLETED)
+        assert ready.is_set(), task.exception()
+        try:
+            async with aiohttp.ClientSession() as session:
+                yield Site(server, f"http://127.0.0.1:{server.address.port}", session)
+        finally:
+            # A host that is made after its server has stopped waiting for it is closed by nobody.
+            made = asyncio.create_task(server.started())
+            await asyncio.wait({task, made}, timeout=PATIENCE, return_when=asyncio.FIRST_COMPLETED)
+            made.cancel()
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
 
 
 def run(test: Any) -> Any:
