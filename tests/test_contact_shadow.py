@@ -53,11 +53,14 @@ def world(material, folder, level=1.0):
     rotation, translation = look_at(np.array([0.0, -0.42, 0.28]), np.array([0.0, 0.0, 0.02]))
     file = folder / f"{level}.exr"
     light(level).save(file)
+    # The other one stands far behind the camera, so that kernels of the close surroundings serve both.
+    (other,) = MATERIALS.keys() - {material}
+    places = {material: (0.0, 0.0, RADIUS), other: (0.0, -1.8, RADIUS)}
     scene = Scene(
         camera=camera,
         name="table",
         proxies=(Proxy("plane", size=(4.0, 4.0)),),
-        objects=(Object("sphere", radius=RADIUS, at=(0.0, 0.0, RADIUS), material=MATERIALS[material]),),
+        objects=tuple(Object("sphere", radius=RADIUS, at=places[one], material=MATERIALS[one]) for one in places),
         captured=CapturedLight(file),
         pose=PoseSpec(((tuple(rotation.ravel().tolist()), tuple(translation.tolist())),)),
         has_marker=False,
