@@ -81,9 +81,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Note in every report which hard cases a test covers; leave slow tests out of runs of whole folders."""
     from tests.hard_cases import atlas
 
-    # Tests in Chromium are the longest: none is left for the end, when other processes are done. Golden frames compile
-    # what the hard cases need, too: of two processes the second one begins with other tests.
-    items.sort(key=lambda item: ("browser" not in item.fixturenames, item.path.stem != "test_golden"))
+    items.sort(key=_turn)
     for item in items:
         item.user_properties += [("atlas", "/".join(map(str, cell))) for cell in atlas.cells_of(item)]
     atlas.collected[:] = items
@@ -94,6 +92,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         _deselect(config, items, [item for item in items if item.get_closest_marker("slow") is None])
     elif _is_plain(config):
         _deselect(config, items, [item for item in items if item.get_closest_marker("slow") is not None])
+
+
+def _turn(item: Any) -> int:
+    """Return the place of a test's kind in the order of tests.
+
+    Golden frames compile what the hard cases need, too: of two processes the second one begins with other tests. Those
+    in Chromium are the longest: they come when kernels are compiled, and none is left for the end.
+    """
+    kinds = item.path.stem == "test_golden", item.path.parent.name == "hard_cases", "browser" in item.fixturenames
+    return (*kinds, True).index(True)
 
 
 def _deselect(config: pytest.Config, items: list[pytest.Item], left_out: list[pytest.Item]) -> None:
