@@ -98,6 +98,7 @@ def look_over(tab: Tab, size: tuple[int, int], phone: bool, artefacts: Path) -> 
     page = tab.page
     if size == (390, 844):
         pinch_the_teapot(tab)
+    tab.hold()  # nothing is lit or drawn while it is looked at
     page.evaluate(NOTICE)
     box = page.locator(".notice.bad").bounding_box()
     assert min(box["x"], box["y"]) >= 0, "the notice is out of sight"
@@ -122,6 +123,8 @@ def look_over(tab: Tab, size: tuple[int, int], phone: bool, artefacts: Path) -> 
                 assert findings(page) == [], (name, scheme)
             if phone:
                 assert page.evaluate(SMALL) == [], (name, scheme)
+    page.evaluate("document.getElementById('play').click()")
+    tab.until("warpAr.state.playing")
 
 
 def reach(page: Any, selector: str, most: int = 80) -> None:
