@@ -64,14 +64,17 @@ def slope(d):
 
 def test_a_light_survives_its_file(tmp_path):
     emitter = CapturedEmitter((0.0, 0.6, 0.8), 0.01, (1.0, 2.0, 3.0), (0.9, 1.9, 2.9), None, 1.5, (0.0, 0.0, 0.1))
-    light = dataclasses.replace(constant(0.5), emitters=(emitter,), exposure=0.02, lower_bound=0.125, white_level=1.0)
+    colors = (0.5, 0.25, 0.0, 0.125, 1.0, 0.0, -0.25, 0.0, 0.5)
+    light = dataclasses.replace(
+        constant(0.5), emitters=(emitter,), exposure=0.02, lower_bound=0.125, white_level=1.0, colors=colors
+    )
     light.save(tmp_path / "deep" / "light.exr")
     again = Light.load(tmp_path / "deep" / "light.exr")
     assert (again.radiance == light.radiance).all()
     assert (again.confidence == light.confidence).all()
     assert again.emitters == light.emitters
     assert again.exposure == pytest.approx(0.02)
-    assert (again.lower_bound, again.white_level) == (0.125, 1.0)
+    assert (again.lower_bound, again.white_level, again.colors) == (0.125, 1.0, colors)
     with OpenEXR.File(str(tmp_path / "deep" / "light.exr")) as file:
         header = dict(file.header())
     assert header["chromaticities"] == pytest.approx(REC_709)
@@ -120,6 +123,7 @@ def test_a_map_in_other_axes_is_turned(tmp_path, axes):
         ({"RGB": np.ones((4, 8, 3), np.float32)}, {"emitters": f"[{NO_NUMBER}]"}, "a number that is not finite"),
         ({"RGB": np.ones((4, 8, 3), np.float32)}, {"whiteLevel": "bright"}, "whiteLevel is 'bright'"),
         ({"RGB": np.ones((4, 8, 3), np.float32)}, {"exposure": float("nan")}, "exposure is 'nan'"),
+        ({"RGB": np.ones((4, 8, 3), np.float32)}, {"cameraColors": "red"}, "cameraColors is 'red'"),
     ],
 )
 def test_files_that_are_no_light(tmp_path, channels, attributes, message):
@@ -173,6 +177,22 @@ def test_scale_and_turn_are_the_scenes(tmp_path, device):
     wanted = 2.0 * Light.load(tmp_path / "light.exr").resampled(64, rotation_matrix([0.0, 0.0, 90.0]))
     assert np.allclose(environment, wanted, rtol=1e-5)
     check_error("captured", environment, 2.0 * slope(latlong_directions(64) @ rotation_matrix([0.0, 0.0, 90.0])))
+
+
+def test_colors_take_light_and_emitters_to_the_cameras(tmp_path, device):
+    """Red and green change places, and blue is halved."""
+    emitter = CapturedEmitter((0.0, 0.6, 0.8), 0.2, (1.0, 2.0, 4.0), (0.5, 1.0, 2.0), None, 0.5)
+    dataclasses.replace(Light(smooth(64), np.ones((64, 128), np.float32)), emitters=(emitter,)).save(
+        tmp_path / "light.exr"
+    )
+    scene = loads_scene(SCENE + "colors = [0, 1, 0, 1, 0, 0, 0, 0, 0.5]\n", tmp_path / "scene.toml")
+    assert loads_scene(dumps_scene(scene), tmp_path / "scene.toml") == scene
+    with Pipeline(scene, device=device, quality="low", outputs=("environment",)) as pipeline:
+        environment = pipeline(np.zeros((72, 96, 3), np.uint8)).environment
+        power = pipeline.arrays["emitters"].numpy()[0]["power"] if "emitters" in pipeline.arrays else None
+    np.testing.assert_allclose(environment, smooth(64)[..., [1, 0, 2]] * (1.0, 1.0, 0.5), rtol=1e-5)
+    assert power is None or power == pytest.approx((2.0, 1.0, 2.0))
+    assert Light.load(tmp_path / "light.exr").recolored(np.diag([-1.0, 1.0, 1.0])).emitters[0].power == (0.0, 2.0, 4.0)
 
 
 def test_virtual_lights_stand_beside_a_captured_one(tmp_path):

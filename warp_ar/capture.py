@@ -74,6 +74,8 @@ def make_parser() -> argparse.ArgumentParser:
     add("--as-clipped", action="store_true", help="do not raise the clipped light of a single photograph")
     text = "the ball's reflectance (default: measured from the plane, else 0.85)"
     add("--reflectance", type=number(0.01, 1.0, "a share from 0.01 to 1"), metavar="R", help=text)
+    text = "colour chart: light becomes linear sRGB"
+    add("--chart", type=Path, metavar="PHOTO", help=text)
     text = "rows of the written map (default: by the ball's size)"
     add("--height", type=number(16, 4096, "16 to 4096 rows", int), metavar="N", help=text)
     add("--axes", choices=AXES, default="z-up", help="axes of the written map (default: z-up)")
@@ -122,7 +124,8 @@ def _check(options: argparse.Namespace) -> None:
     writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}
     writes = {name: path for name, path in writes.items() if path is not None}
     writes |= {f"*{end}": options.output.with_suffix(end) for end in (PREVIEW, RESPONSE)}
-    claim_places({"the photographs": list(options.photos)}, writes, overwrite=options.overwrite)
+    reads = [*options.photos, *filter(None, [options.chart])]
+    claim_places({"the photographs": reads}, writes, overwrite=options.overwrite)
 
 
 def _check_radius(options: argparse.Namespace) -> None:
@@ -138,7 +141,8 @@ def make_scene(found: Capture, light: Path) -> Scene:
     assert found.support is not None
     unit = found.support.radius_of(found.outline.sphere)
     x, y, _ = map(float, found.support.pose.inverse().apply(unit * np.array(found.outline.sphere)))
-    return scene_on(found.support, found.camera, found.shown, CapturedLight(light.resolve()), (x, y), unit)
+    captured = CapturedLight(light.resolve(), colors=found.light.colors)
+    return scene_on(found.support, found.camera, found.shown, captured, (x, y), unit)
 
 
 def draw_outline(found: Capture) -> bytes:
@@ -177,6 +181,7 @@ def capture(options: argparse.Namespace) -> int:
         device=options.device,
         height=options.height,
         raises=not options.as_clipped,
+        chart=options.chart,
     )
     for note in found.notes:
         say(note)
@@ -185,7 +190,8 @@ def capture(options: argparse.Namespace) -> int:
         raise UsageError(f"--scene {options.scene} needs the plane: {right}")
     found.light.save(options.output, options.axes)
     emitters = counted(len(found.light.emitters), "emitter")
-    print(f"{options.output}: light in camera values of {found.shown.name}, {emitters}")
+    colors = "camera values" if options.chart is None else "linear sRGB at the exposure"
+    print(f"{options.output}: light in {colors} of {found.shown.name}, {emitters}")
     for emitter in found.light.emitters:
         x, y, z = emitter.direction
         most = "or more" if emitter.high is None else f"to {sum(emitter.high) / 3:.3g}"

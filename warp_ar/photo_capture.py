@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.ball.ball_finder import BallOutline, exact_outline, far_camera, find_ball, sphere_of_circle
+from warp_ar.calibration.chart import measure_chart
 from warp_ar.calibration.response import write_response
 from warp_ar.checks.check_ball import DULL, disc_contrast
 from warp_ar.declared import checked
@@ -97,6 +98,7 @@ def capture_light(
     device: str = "auto",
     height: int | None = None,
     raises: bool = True,
+    chart: str | Path | None = None,
 ) -> Capture:
     """Capture the light that a mirror ball shows in one photograph or in a bracket of exposures.
 
@@ -118,10 +120,13 @@ def capture_light(
         height: Rows of the map; None: chosen by the ball's size in pixels.
         raises: Whether clipped light of a single photograph is raised by the least amount that the clipping prior
             expects (``light/least_missing.py``).
+        chart: Photograph of a colour chart by the same camera with the same white balance, of ``paths`` or another: the
+            light is in linear sRGB by it, and in camera values times its ``colors``. None: the light is in camera
+            values.
 
     Raises:
         SourceError: A photograph cannot be read.
-        UsageError: Exposures contradict each other, or no ball was found.
+        UsageError: Exposures contradict each other, or no ball or chart was found.
     """
     if not paths:
         raise UsageError("no photographs; expected one or more of a mirror ball")
@@ -165,6 +170,10 @@ def capture_light(
         )
     if disc_contrast(reference.image, (*outline.center, outline.radius)) < DULL:
         notes.append("the ball's picture shows no reflections: is a ball there, uncovered and polished?")
+    codes = decode_table(transfer) if bracket.curve is None else bracket.curve.astype(np.float32)
+    if chart is not None:
+        colors, note = measure_chart(read_photograph(chart).image, codes, str(chart))
+        notes.append(note)
     found = None
     if support is not None:
         found = support(outline, camera)
@@ -178,13 +187,14 @@ def capture_light(
     table = None
     if found is not None:
         turn = found.pose.rotation
-        codes = decode_table(transfer) if bracket.curve is None else bracket.curve.astype(np.float32)
         table = Table.under(outline, reference.image, camera, found, codes)
     mirrored, note = _ball_reflectance(table, reflectance)
     notes.append(note)
     maps = _unwrap(bracket, reference, camera, outline, turn, mirrored, device, height or _rows_of(outline.radius))
     light, more = _make_light(maps, bracket, table, raises)
     light = dataclasses.replace(light, exposure=reference.info.exposure)
+    if chart is not None:
+        light = dataclasses.replace(light.recolored(colors), colors=tuple(np.linalg.inv(colors).ravel().tolist()))
     notes += [*maps.notes, *more]
     return Capture(light, outline, reference.path, camera, reference.image, found, tuple(notes), bracket.curve)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_ar.calibration.chart import measure_chart
 from warp_ar.command_line import EXIT_DONE, LEAST, Parser, ending, number, pixel, run_command
 from warp_ar.errors import SinkError, UsageError, say
 from warp_ar.files import store
@@ -75,6 +76,8 @@ def make_parser() -> argparse.ArgumentParser:
     text = "metres per unit of it (default: 1)"
     add("--colmap-scale", type=number(LEAST, 1e9, "metres above 0"), metavar="M", help=text)
     parser.add_common("--focal-35mm")
+    text = "colour chart, if the plate's camera differs"
+    add("--chart", type=Path, metavar="PHOTO", help=text)
     text = "radius of the two balls, metres (default: 0.04)"
     add("--object-radius", type=number(LEAST, 1e9, "metres above 0"), default=0.04, metavar="M", help=text)
     return parser
@@ -172,12 +175,18 @@ def find_camera(plate: Photograph, find: Callable[[Camera], Support], count: int
 def place(options: argparse.Namespace) -> int:
     """Find the camera's pose, scale the light to the plate's exposure, and write the scene."""
     seen = _check(options)
-    plate, light = read_photograph(options.plate), Light.load(options.light)
+    plate, light, codes = read_photograph(options.plate), Light.load(options.light), decode_table("srgb")
+    colors = light.colors
+    if options.chart is not None:
+        matrix, note = measure_chart(read_photograph(options.chart).image, codes, str(options.chart))
+        colors = tuple(np.linalg.inv(matrix).ravel().tolist())
+        say(note)
+    if colors is not None:
+        light = light.recolored(np.reshape(colors, (3, 3)))
     camera, support, middle = find_pose(plate, options)
     scale, by_card = 1.0, None
     if seen:
-        irradiance, codes = irradiance_above(light.radiance), decode_table("srgb")
-        by_card = exposure_by_paper(plate.image, camera, support, codes, irradiance)
+        by_card = exposure_by_paper(plate.image, camera, support, codes, irradiance_above(light.radiance))
     if light.exposure is not None and plate.info.exposure is not None:
         scale = plate.info.exposure / light.exposure
         say(f"the plate has {scale:.3g} times the light's exposure")
@@ -187,7 +196,7 @@ def place(options: argparse.Namespace) -> int:
     else:
         whose = options.light if light.exposure is None else options.plate
         say(f"{whose} states no exposure: the plate's is assumed for the light; [light] scale corrects it")
-    captured = CapturedLight(options.light.resolve(), scale=scale)
+    captured = CapturedLight(options.light.resolve(), scale=scale, colors=colors)
     scene = scene_on(support, camera, options.plate, captured, middle, options.object_radius)
     store(options.scene, dumps_scene(scene, options.scene.parent).encode())
     print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")

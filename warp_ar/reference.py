@@ -107,8 +107,10 @@ def trace(options: argparse.Namespace) -> int:
 def _check_axes(scene: Scene) -> None:
     """Warn if reading the saved light, in the scene's axes and values, would rotate or scale it again."""
     given = scene.captured
-    if given is not None and (given.rotate != (0.0, 0.0, 0.0) or given.scale != 1.0):
-        raise UsageError("--save-light: [light] has scale or rotate, which would be applied again; leave them out")
+    if given is not None and (given.rotate != (0.0, 0.0, 0.0) or given.scale != 1.0 or given.colors):
+        raise UsageError(
+            "--save-light: [light] has scale, colors or rotate, which would be applied again; leave them out"
+        )
 
 
 def places_found(light: Light) -> str:

@@ -3,8 +3,9 @@
 The file is an OpenEXR latlong with channels R, G, B (linear, in camera values of the shown exposure: 1 clips) and
 ``confidence`` (1: seen; 0: filled from neighbours). Its attributes are ``axes``, ``chromaticities``, ``whiteLevel``
 (the value at which the capture's camera clipped), ``exposure`` (t ISO / (100 N^2), 0 if unknown), ``lowerBound`` (the
-share of the light that is a lower bound, because it clips in the shortest exposure) and ``emitters`` (JSON). A file of
-another program lacks them: its values are read as by `exr_file.read_linear_picture`, its axes as by
+share of the light that is a lower bound, because it clips in the shortest exposure), ``emitters`` (JSON) and, if a
+colour chart gave the colours, ``cameraColors`` (3x3: from the file's RGB, which is then Rec. 709's, to camera values).
+A file of another program lacks them: its values are read as by `exr_file.read_linear_picture`, its axes as by
 `latlong_axes.axes_of`.
 """
 
@@ -76,6 +77,9 @@ class Light:
     """Exposure t ISO / (100 N^2) that was shown; None if unknown."""
     lower_bound: float = 0.0
     """Share of the light that is a lower bound, 0 to 1."""
+    colors: tuple[float, ...] | None = None
+    """Matrix from the light's RGB to camera values, row by row, if a colour chart gave it; None: it has camera
+    values."""
 
     def __post_init__(self) -> None:
         """Check all values.
@@ -94,6 +98,20 @@ class Light:
         for name, most in (("white_level", math.inf), ("exposure", math.inf), ("lower_bound", 1.0 + 1e-6)):
             if not 0.0 <= (getattr(self, name) or 0.0) <= most:
                 raise UsageError(f"Light: {name} = {getattr(self, name)}: expected a number from 0 to {most:g}")
+
+    def recolored(self, matrix: Array) -> Light:
+        """Return the light with its RGB multiplied by a matrix (3, 3); values below 0 become 0."""
+
+        def changed(value: Any) -> Any:
+            return np.maximum(value @ matrix.T, 0.0)
+
+        emitters = []
+        for emitter in self.emitters:
+            powers = ((name, getattr(emitter, name)) for name in ("power", "low", "high"))
+            told: dict[str, Any] = {name: _triple(changed(power)) for name, power in powers if power is not None}
+            emitters.append(dataclasses.replace(emitter, **told))
+        radiance = np.asarray(changed(self.radiance), np.float32)
+        return dataclasses.replace(self, radiance=radiance, emitters=tuple(emitters))
 
     @checked
     def save(self, path: str | Path, axes: str = "z-up") -> None:
@@ -121,6 +139,8 @@ class Light:
             "lowerBound": float(self.lower_bound),
             "emitters": json.dumps([dataclasses.asdict(emitter) for emitter in emitters]),
         }
+        if self.colors is not None:
+            header["cameraColors"] = np.reshape(self.colors, (3, 3)).astype(np.float32)
         channels = {"RGB": np.ascontiguousarray(radiance), "confidence": np.ascontiguousarray(confidence)}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -151,6 +171,9 @@ class Light:
         header = picture.header
         confidence = np.clip(picture.others.get("confidence", np.ones((height, width), np.float32)), 0.0, 1.0)
         emitters = _parse_emitters(path, header.get("emitters", "[]"))
+        colors = header.get("cameraColors")
+        if colors is not None and not (np.shape(colors) == (3, 3) and np.isfinite(colors).all()):
+            raise SceneError(f"{path}: its attribute cameraColors is {str(colors)[:40]!r}; expected 3x3 finite numbers")
         if axes != "z-up":
             radiance, confidence = (from_axes(channel, axes) for channel in (radiance, confidence))
             emitters = tuple(_turned(emitter, world_from_marker(axes).T) for emitter in emitters)
@@ -161,6 +184,7 @@ class Light:
             _attribute(path, header, "whiteLevel", 1.0),
             _attribute(path, header, "exposure", 0.0) or None,
             min(_attribute(path, header, "lowerBound", 0.0), 1.0),
+            None if colors is None else tuple(map(float, np.ravel(colors))),
         )
 
     def resampled(self, height: int, rotation: Array | None = None) -> Map:

@@ -623,6 +623,8 @@ class CapturedLight(Checked):
     """Latlong OpenEXR or Radiance HDR, by ``warp_ar.capture`` or another program."""
     scale: Annotated[float, Key("-", "0.5", low=SMALLEST)] = 1.0
     """Factor on the file's values, to match the camera's."""
+    colors: Annotated[tuple[float, ...] | None, Key("-", "[0.8, 0.2, 0, 0.1, 0.9, 0, 0, 0.2, 0.7]", sizes=(9,))] = None
+    """Matrix from the file's RGB to the camera's, row by row."""
     rotate: Turn = ORIGIN
     """Degrees about the fixed x, then y, then z axis."""
     axes: Annotated[str | None, Key("-", '"y-up"', words=LATLONG_AXES)] = None

@@ -54,6 +54,8 @@ class Captured(Stage):
         spec = self.request.scene.captured
         assert spec is not None
         light = Light.load(spec.file, spec.axes)
+        if spec.colors is not None:
+            light = light.recolored(np.reshape(spec.colors, (3, 3)))
         turn = rotation_matrix(spec.rotate)
         self._radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
 
