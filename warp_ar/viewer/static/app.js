@@ -53,12 +53,16 @@ const adopt = (next) => {
   scenePanel.scene = scene;
   quality.scene = scene;
   setup.scene = scene;
-  const first = scene.objects.find((one) => one.visible);
-  $("hint").hidden = !first || !!localStorage.getItem("warp_ar.dragged");
-  if (first) $("hint").textContent = `The ${(first.file ?? first.shape).replace(/\.\w+$/, "").replaceAll("_", " ")} is not real. Drag it.`;
+  showHint();
   $("captured-note").hidden = !scene.captured;
   $("captured-note").textContent = scene.captured ? `The light of ${scene.captured} replaces the mirror ball's.` : "";
 };
+/** Until the first drag, as soon as the picture shows what is to be dragged. */
+function showHint() {
+  const first = scene?.objects.find((one) => one.visible);
+  $("hint").hidden = !first || !view.stats.plan || !!localStorage.getItem("warp_ar.dragged");
+  if (first) $("hint").textContent = `The ${(first.file ?? first.shape).replace(/\.\w+$/, "").replaceAll("_", " ")} is not real. Drag it.`;
+}
 let waiting = null;
 // A scene from before this page's last edit would take that edit back on the screen, and the next key or drag would begin there.
 const adoptWaiting = () => {
@@ -172,6 +176,7 @@ view.addEventListener("shown", ({ detail: frame }) => {
   time.frame(frame);
   setup.frame(frame);
   showOnCards(frame);
+  if (frame.plan && $("hint").hidden) showHint();
   $("track-state").className = `chip ${frame.state ?? ""}`;
   $("track-state").lastElementChild.textContent = frame.state === null ? (frame.plan ? "no marker needed" : "not lit yet") : { tracked: "marker found", held: "marker hidden", lost: "marker not seen" }[frame.state];
 });
