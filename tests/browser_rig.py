@@ -195,7 +195,7 @@ class Tab:
         deadline = time.monotonic() + PATIENCE
         while not (value := self.page.evaluate(expression)):
             assert time.monotonic() < deadline, f"{what or expression} in vain; errors: {self.errors}"
-            self.page.wait_for_timeout(50)
+            self.page.wait_for_timeout(100)
         return value
 
     def shown(self, more: int = 3) -> None:
