@@ -1,1 +1,1 @@
-"""Kernels that shade virtual objects and the mirror ball."""
+"""Kernels that shade virtual objects."""

@@ -88,22 +88,22 @@ SHARP_ALPHA = 0.02
 """Lobe width alpha below which a surface is a mirror."""
 SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 RAY_WIDTH = 2.0
-"""Width at which a lobe's ray reads the environment, over the width of its share of the lobe."""
+"""Width over which a ray filters the environment, over the width of the part of the lobe that it represents."""
 LOBE_ANGLE = 1.0
-"""Side of the footprint of a lobe's ray in the frame, as an angle, over the ray's width. A ray's whole share has a side
-of 1.77, but so wide a footprint would cross the edges of surfaces."""
+"""Angle of the side of a lobe ray's square footprint in the frame, over the ray's width. The part of the lobe that a
+ray represents has a side of 1.77, but so wide a footprint would cross the edges of surfaces."""
 SAME_SURFACE = wp.constant(wp.float32(0.5))
-"""Least cosine between the normals of neighbours from which a mirror's curvature is estimated."""
+"""Least cosine between the normals of two neighbouring pixels whose difference gives a mirror's curvature."""
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness |B|, in camera values, below which |M| / |B| is not computed."""
 NO_RAY = wp.constant(wp.float32(-1.0))
-"""Share that marks a pixel whose rays all went into its own surface: its lobe was not sampled."""
+"""Value of s for a pixel all of whose rays point below its surface: its lobe was not sampled."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 """Least cosine between the normals of neighbours that are averaged."""
 
 
 OWN_RAYS = 4
-"""Number of a pixel's rays into a lobe from which on neighbours are weighted by the difference of normals."""
+"""Least number of lobe rays per pixel at which neighbours are weighted by the difference of normals."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,15 +113,15 @@ class NearFieldConfig:
     distant: DistantLightConfig
     """Kinds of shape and forms of light."""
     count: int
-    """Samples of the environment per pixel, of each set."""
+    """Samples of the environment per set; a pixel uses one set."""
     lobe_count: int
     """Rays per pixel into a glossy lobe; 0 if no object has one."""
     mirror_samples: int
     """Points within a pixel from which a mirror sends a ray, a square number; 0 if no object is a mirror."""
     side: int
-    """Pixels along a tile."""
+    """Pixels along a tile (square of pixels with different sets of samples)."""
     ratio: bool
-    """True if objects shade the receiver."""
+    """True if objects cast shadows on the receiver."""
     added: bool
     """True if virtual lights light the receiver."""
     known: bool = False
@@ -141,14 +141,17 @@ def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) ->
 
 @wp.func
 def ggx_ray_width(cos_theta: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Return the width of a ray times the square root of their number; ``cos_theta`` of half vector and normal."""
+    """Return the width of a GGX lobe's ray times the square root of the number of rays.
+
+    ``cos_theta`` is the cosine between half vector and normal.
+    """
     cos2 = wp.min(cos_theta * cos_theta, 1.0)
     return (1.0 - cos2) / alpha + alpha * cos2
 
 
 @wp.func
 def phong_ray_width(cos_theta: wp.float32, exponent: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Return the width of a Phong lobe's ray times the square root of their number, at most 1.
+    """Return the width of a Phong lobe's ray times the square root of the number of rays, at most 1.
 
     ``cos_theta`` is the cosine between the ray and the mirror direction.
     """
@@ -163,11 +166,11 @@ class NearRay:
     direction: wp.vec3
     reach: wp.float32  # length, metres
     spread: wp.float32  # width over length
-    point: wp.vec3  # point that it leaves, without offset
+    point: wp.vec3  # point of the surface that the ray leaves; ``origin`` is offset from it
     radiance: wp.vec3  # radiance of the environment's sample
     weight: wp.float32  # cosine times measure of the sample, times its ball's share
-    leaves: wp.bool  # whether it leaves the surface; False: it goes into it
-    covers: wp.bool  # whether it has a footprint, over which the surface that it meets is filtered
+    leaves: wp.bool  # True if the direction is above the surface, False if below
+    covers: wp.bool  # True if the ray has a footprint, over which the surface that it meets is filtered
 
 
 @wp.struct
@@ -186,7 +189,7 @@ class SeenPoint:
 
 
 def ray_width(config: NearFieldConfig) -> float:
-    """Return the width of a lobe's ray, among all rays of a tile, over ``NearRay.spread``."""
+    """Return the filter width of one of all lobe rays of a tile, over ``NearRay.spread`` (that of a single ray)."""
     return RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
 
 
@@ -223,7 +226,7 @@ def make_footprint_of(config: NearFieldConfig) -> wp.Function:
 def look_up_proxy(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, ray: NearRay, fp: Footprint, proxy: Hit, at: wp.vec2
 ) -> wp.vec3:
-    """Return the radiance of a proxy's point, which the frame shows at ``at``, filtered over the ray's footprint."""
+    """Return a proxy's radiance in the frame around the point ``at``, pixels, filtered over the ray's footprint."""
     normal = proxy.geometric_normal
     across = covered_on(fp.origin_x, fp.turn_x, proxy.t, ray.direction, normal)
     along = covered_on(fp.origin_y, fp.turn_y, proxy.t, ray.direction, normal)
@@ -235,15 +238,16 @@ def look_up_proxy(
 
 @wp.func
 def spread_at(fp: Footprint, t: wp.float32) -> wp.float32:
-    """Return a ray's width over its length at distance t; the width is the side of a square of the footprint's area."""
+    """Return the ratio of a ray's width to its length t; the width is the square root of its footprint's area."""
     area = wp.length(wp.cross(fp.origin_x + t * fp.turn_x, fp.origin_y + t * fp.turn_y))
     return wp.sqrt(area) / wp.max(t, 1.0e-6)
 
 
 @wp.func
 def mirrored_level(fp: Footprint, height: wp.int32) -> wp.float32:
-    """Return the environment's level for the footprint of a mirror's ray, less the texel that level 0 has anyway.
+    """Return the level of the environment that matches the footprint of a mirror's ray.
 
+    The solid angle of a texel of level 0 is subtracted, as that level is filtered over it already.
     A GGX lobe of width alpha has the peak density of a solid angle of 4 pi alpha^2.
     """
     covered = wp.length(wp.cross(fp.turn_x, fp.turn_y))
@@ -253,7 +257,7 @@ def mirrored_level(fp: Footprint, height: wp.int32) -> wp.float32:
 
 @functools.cache
 def make_look_near(config: NearFieldConfig) -> wp.Function:
-    """``look_near(...) -> vec4``: (radiance, 1) of a near surface on a ray; zero if it meets only the environment.
+    """``look_near(...) -> vec4``: (radiance, 1) of the first near surface on a ray, or zero if there is none.
 
     The receiver's radiance includes virtual shadows and virtual light.
     """
@@ -306,7 +310,7 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
 
 @wp.struct
 class Step:
-    """Difference of the reflected rays of a neighbour and of a pixel."""
+    """Difference between a neighbouring pixel's reflected ray and a pixel's own."""
 
     found: wp.bool
     origin: wp.vec3  # difference of the origins, metres
@@ -317,7 +321,7 @@ class Step:
 def step_to(
     params: FrameParams, picture: Picture, visible: VisibleObjects, at: SeenPoint, i: wp.int32, j: wp.int32
 ) -> Step:
-    """Return the step to pixel (i, j); not found if it shows another object, or if there is a crease between."""
+    """Return the step from a point to pixel (i, j); not found if that shows another object or lies beyond a crease."""
     out = Step()
     if not inside_rect(i, j, params.object_rect):
         return out
@@ -346,7 +350,10 @@ def shorter_step(
     axis: wp.vec3,
     angle: wp.float32,
 ) -> Step:
-    """Return the smaller step of those to two opposite neighbours; if none is found, that of a plane mirror."""
+    """Return the smaller of the steps to two opposite neighbours, or a plane mirror's step if neither is found.
+
+    ``aside`` is the offset to a neighbour; ``axis`` and ``angle`` give the plane mirror's step.
+    """
     out = step_to(params, picture, visible, at, pixel[0] - aside[0], pixel[1] - aside[1])
     second = step_to(params, picture, visible, at, pixel[0] + aside[0], pixel[1] + aside[1])
     if second.found and (not out.found or wp.length_sq(second.turn) < wp.length_sq(out.turn)):
@@ -361,7 +368,7 @@ def shorter_step(
 def pixel_footprint(
     params: FrameParams, picture: Picture, visible: VisibleObjects, at: SeenPoint, pixel: wp.vec2i, angle: wp.float32
 ) -> Footprint:
-    """Return the differentials of the reflected ray over a pixel of width ``angle``, by differences to neighbours."""
+    """Return a pixel's reflected ray differentials by differences to neighbours; ``angle`` is the pixel's, radians."""
     axes = frame_from_normal(reflect(at.wo, at.normal))
     across = wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
     down = wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
@@ -433,7 +440,7 @@ def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32)
 
 @wp.func
 def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
-    """Return a ray into the lobe of a glossy surface, drawn by two numbers in [0, 1)."""
+    """Return a ray into the lobe of a glossy surface, sampled by ``u``, two numbers in [0, 1)."""
     out = NearRay()
     if at.surface.model == PHONG:
         center = reflect(at.wo, at.normal)
@@ -457,7 +464,7 @@ def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
 
 @functools.cache
 def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
-    """``mirror_ray(params, scene, at, k) -> NearRay``: reflected ray of sample ``k`` of a mirror's pixel."""
+    """``mirror_ray(params, scene, at, k) -> NearRay``: mirror reflection of the camera ray ``k`` of a pixel."""
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
 
@@ -578,8 +585,8 @@ def make_count_rays(config: NearFieldConfig) -> wp.Function:
 def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel.
 
-    All kinds of rays go through one loop, so that the code that traces them is there once. A copy for each kind, and
-    for each iteration of an unrolled loop, takes NVRTC nine times as long.
+    One loop traces all kinds of rays, so that the code of tracing is compiled once. A copy for each kind, and for each
+    iteration of an unrolled loop, takes NVRTC nine times as long.
     """
     see_point, count_rays = make_see_point(config), make_count_rays(config)
     pick_ray, look_near = make_pick_ray(config), make_look_near(config)
@@ -617,7 +624,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         total = wp.vec3(0.0)
         reflected = wp.vec4(0.0)
         transmitted = wp.vec4(0.0)
-        leaving = float(0.0)  # rays that leave the surface; the loss of others is part of its reflectance
+        leaving = float(0.0)  # rays above the surface; the loss of those below it is part of its reflectance
         for n in range(diffuse + rays[1]):
             ray = pick_ray(params, scene, samples, distant.others.places, at, n, diffuse)
             near = wp.vec4(0.0)
@@ -775,7 +782,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
 
 
 estimate_near_field = row_launcher(make_near_field_kernel, like=lambda params, picture, *_: picture.rays)
-"""Estimate the near field of the objects, each pixel with one set of samples.
+"""Estimate the near field at each pixel of an object, with one set of samples.
 
 Args:
     config: Features of the scene; arguments that it does not use may be None, or empty in a struct.

@@ -4,8 +4,8 @@ The receiver's radiance is known from two sources: the environment, as seen from
 frame, whose points the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy
 uses the frame. The environment is used for points outside the frame, on faces turned away from the camera, or hidden
 from it by a proxy or a ball. Proxies are taken to be matt: their radiance toward the camera and toward the ray is the
-same. Emitters of the environment whose positions are known are seen, and light objects, from there (see ``emitters``).
-The light of several mirror balls is interpolated (see ``probe_weights``).
+same. Emitters of the environment whose positions are known appear, and light objects, from those positions
+(``emitters``). The light of several mirror balls is interpolated (see ``probe_weights``).
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ from warp_ar.kernels.structs import (
 wp.set_module_options({"enable_backward": False})
 
 HIDDEN_MARGIN = wp.constant(wp.float32(1.0e-3))
-"""Relative distance from a point, along the camera's ray, within which a proxy does not hide the point."""
+"""Relative distance before a point, on the camera's ray, within which a proxy counts as the point's own surface."""
 RAY_SPREAD = wp.constant(wp.float32(0.1))
-"""Angle, radians, of one of a few dozen rays, for look-ups in textures of the surface that it meets."""
+"""Angle, radians, that each of a few dozen rays represents: width of look-ups in textures that the ray meets."""
 
 DiffuseForm = Literal["none", "sh", "map"]
 
@@ -77,7 +77,7 @@ class DistantLightConfig:
     """True if rays that meet an emitting object return its light; False if ``area_lights`` adds it."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
-        """Return a configuration for any scene, in which forms that the scene does not need may be empty.
+        """Return this configuration with the code that any scene needs; forms of light that a scene lacks may be empty.
 
         Args:
             form: Form of irradiance for scenes that need it.
@@ -105,7 +105,7 @@ class DistantLight:
 
 @wp.func
 def look_up(picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec3:
-    """Sample a frame's linear radiance bilinearly at (x, y), inside the outermost pixel centres."""
+    """Sample a frame's linear radiance bilinearly at (x, y), pixels, within the outermost pixel centres."""
     j = wp.min(wp.int32(x), picture.frame.shape[1] - 2)
     i = wp.min(wp.int32(y), picture.frame.shape[0] - 2)
     fx = x - wp.float32(j)
@@ -129,19 +129,22 @@ def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> w
 
 @wp.func
 def knows_irradiance(distant: DistantLight) -> wp.bool:
-    """Return whether this scene has irradiance; kernels for any scene contain the code in either case."""
+    """Return whether the scene has irradiance; a kernel for any scene must ask at run time."""
     return distant.irradiance_map.shape[0] > 0 or distant.irradiance_sh.shape[0] > 0
 
 
 @wp.func
 def knows_levels(distant: DistantLight) -> wp.bool:
-    """Return whether this scene has the prefiltered environment."""
+    """Return whether the scene has the prefiltered environment."""
     return distant.levels.shape[0] > 0
 
 
 @functools.cache
 def make_find_in_frame(trace: TraceConfig) -> wp.Function:
-    """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: pixel (x, y) of a proxy's point; x = -1: none."""
+    """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: pixel (x, y) that shows a proxy's hit.
+
+    x is -1 if the camera does not see the hit.
+    """
     occluded_by_proxies = make_trace(trace).occluded_by_proxies
 
     @wp.func(module="unique")
@@ -268,7 +271,7 @@ def make_radiance_along(config: DistantLightConfig, captured: bool = False) -> w
 
 @functools.cache
 def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
-    """``reflected_radiance(distant, model, roughness, shininess, point, direction, floor) -> vec3``: as a lobe sees it.
+    """``reflected_radiance(distant, model, roughness, shininess, point, direction, floor) -> vec3``: mean over a lobe.
 
     The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
     a surface that the camera sees, more for one of many rays.

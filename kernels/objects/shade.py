@@ -61,7 +61,7 @@ from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene, filled
 
 wp.set_module_options({"enable_backward": False})
 
-# Neighbours further off the tangent plane than this many pixel footprints belong to another surface.
+# Distance from the tangent plane, in pixel footprints, beyond which a neighbour belongs to another surface.
 EDGE_FOOTPRINTS = wp.constant(wp.float32(2.0))
 # Cosine of the turn between neighbouring normals that counts as an edge.
 EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
@@ -76,7 +76,7 @@ SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
 
 @dataclasses.dataclass(frozen=True)
 class ShadeConfig:
-    """Features that a scene needs; others are not compiled in."""
+    """Compile-time configuration: features that a scene needs."""
 
     distant: DistantLightConfig
     """Kinds of shape, of material and of the environment."""
@@ -89,10 +89,13 @@ class ShadeConfig:
     near_field: bool = False
     """True if objects receive light from the near field (``near_field``)."""
     area_samples: int = 0
-    """Samples of emitting objects, per point; ``area_lights.POINT_SAMPLES``: as point lights; 0: nothing emits."""
+    """Samples of emitting objects per point; ``area_lights.POINT_SAMPLES``: they are point lights; 0: none emits."""
 
     def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
-        """Return a configuration for any scene with as many mirror balls; ``form`` as in ``DistantLightConfig``."""
+        """Return this configuration with the code that any scene needs, and soft shadows if ``soft``.
+
+        ``form`` is the form of irradiance for scenes that need it.
+        """
         distant = self.distant.general(form)
         return dataclasses.replace(self, distant=distant, lights=ALL_LIGHTS, soft=soft)
 
@@ -133,7 +136,7 @@ class NearPoint:
 
 @wp.func
 def face_viewer(normal: wp.vec3, geometric_normal: wp.vec3, wo: wp.vec3):
-    """Turn both normals of a surface toward the viewer; the shading normal keeps a cosine of ``MIN_FACING``."""
+    """Return both normals of a surface, turned toward the viewer; the shading normal has a cosine >= ``MIN_FACING``."""
     shading = normal
     geometric = geometric_normal
     if wp.dot(geometric, wo) < 0.0:
@@ -147,7 +150,10 @@ def face_viewer(normal: wp.vec3, geometric_normal: wp.vec3, wo: wp.vec3):
 
 @functools.cache
 def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
-    """``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: reflected light of emitters."""
+    """``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: reflected light of emitters.
+
+    Emitters are the scene's emitting objects.
+    """
     trace, samples = config.distant.trace, config.area_samples
     reflect_direct = make_reflect_direct(config.distant.models)
     is_lit = make_shadow(trace)
@@ -291,7 +297,10 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
 def differs(
     i: wp.int32, j: wp.int32, found: wp.int32, reach: wp.float32, rect: wp.vec4i, visible: VisibleObjects, hit: Hit
 ) -> wp.bool:
-    """Return whether a neighbour shows another surface than this pixel, as the module's text defines edges."""
+    """Return whether pixel (i, j) shows another surface than a neighbour, whose hit is ``hit`` of object ``found``.
+
+    ``reach`` is the largest distance, metres, from the tangent plane at ``hit``.
+    """
     other = wp.int32(-1)
     if inside_rect(i, j, rect):
         other = visible.objects[i, j]
@@ -307,9 +316,9 @@ def differs(
 
 @wp.func
 def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> wp.vec2i:
-    """Return the pixel, of a pixel and its eight neighbours, whose normal is most similar to a hit's.
+    """Return (row, column) of the pixel around (i, j), of nine, whose normal is most similar to a hit's.
 
-    Equal normals are decided by distance. The result is (-1, -1) if none shows the hit's object.
+    Among equal normals the nearest pixel is returned. The result is (-1, -1) if none shows the hit's object.
     """
     objects = visible.objects
     hits = visible.hits
@@ -330,7 +339,10 @@ def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> w
 
 @functools.cache
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
-    """``shade_sample(...) -> vec4``: radiance and coverage of one sample of a pixel; ``ALONE`` is its centre's hit."""
+    """``shade_sample(...) -> vec4``: radiance and coverage of one sample of a pixel.
+
+    The sample ``ALONE`` shades the hit ``centre``.
+    """
     shade_hit = make_shade_hit(config)
     closest_visible = make_primary(config.distant.trace)
     centre_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
@@ -382,10 +394,9 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
 
     Args:
         config: Features of the scene.
-        edges: ``SAMPLED``: edges are sampled in place. ``LISTED``: edges are listed, and left to another kernel.
-            ``LEFT``: all edges are sampled in place if the list did not hold all of them, else none. (The edges that a
-            full list holds depend on the order of threads, and kernels that are compiled separately differ in the last
-            place.)
+        edges: ``SAMPLED``: this kernel samples edges. ``LISTED``: it lists edges for another kernel. ``LEFT``: it
+            samples all edges if the list did not hold all of them, else none. (The edges that a full list holds depend
+            on the order of threads, and kernels that are compiled separately differ in the last place.)
     """
     shade_sample = make_shade_sample(config)
 
@@ -443,7 +454,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
 
 @functools.cache
 def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
-    """Kernel that shades every sample of the edges that were listed."""
+    """Kernel that shades every sample of the listed edge pixels."""
     shade_sample = make_shade_sample(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -484,8 +495,8 @@ def shade(
 ) -> None:
     """Shade the objects that ``trace_pixels`` found.
 
-    Given ``edge_lists``, edges are listed and sampled in a kernel of their own. The result is the same but for the last
-    places, where CUDA's compiler fuses a product and a sum in one kernel alone.
+    If ``edge_lists`` is given, edges are listed and then sampled in a separate kernel. Results differ in the last bits
+    at most, where CUDA's compiler fuses a product and a sum in only one of the kernels.
 
     Args:
         config: Features of the scene; arguments that it does not use may be None.
@@ -495,7 +506,7 @@ def shade(
         light: From ``make_object_light``; its near field is needed if ``config.near_field``.
         visible: (H, W) from ``trace_pixels``.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
-        edge_lists: Scratch, for a launch over all rows.
+        edge_lists: Scratch memory, for a launch over all rows.
         rows: Band of rows; None means all.
     """
     inputs = [params, rays, scene, light, visible]

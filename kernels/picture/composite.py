@@ -2,11 +2,11 @@
 
     radiance = (1 - alpha) (frame * shadow_ratio + added_light + mirror_ball) + virtual
 
-in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that no layer changes keeps the frame's
-code bit for bit, whatever the transfer function. A layer is read only inside its rectangle of ``FrameParams``: values
-elsewhere may be of an earlier frame.
+in linear light; ``virtual`` is premultiplied by its coverage alpha. A *code* is an 8-bit pixel value. A pixel that no
+layer changes keeps the frame's code exactly. A layer is read only inside its rectangle of ``FrameParams``: values
+outside it may belong to an earlier frame.
 
-Output values end at the codes at which the camera's channels saturate, or at the frame's own code where that is higher.
+Output codes are limited to those at which the camera's channels saturate, or to the frame's code if that is higher.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class LayersAt:
 
 @wp.func
 def read_layers(params: wp.array[FrameParams], layers: Layers, row: wp.int32, col: wp.int32) -> LayersAt:
-    """Return the layers at a pixel; an empty layer, or one whose rectangle does not hold the pixel, is 0 (a ratio 1).
+    """Return the layers at a pixel; 0, or 1 for the ratio, if a layer is empty or its rectangle excludes the pixel.
 
-    All are read before any value is used, so that their memory latencies overlap.
+    All layers are read before any value is used, so that their memory latencies overlap.
     """
     at = LayersAt()
     at.ratio = wp.vec3(1.0, 1.0, 1.0)
@@ -62,7 +62,7 @@ def read_layers(params: wp.array[FrameParams], layers: Layers, row: wp.int32, co
 
 @wp.func
 def is_changed(at: LayersAt) -> wp.bool:
-    """Return whether layers change a pixel; NaN counts as a change."""
+    """Return whether any layer changes the pixel's radiance; NaN counts as a change."""
     neutral = at.objects == wp.vec4(0.0, 0.0, 0.0, 0.0) and at.added == wp.vec3(0.0, 0.0, 0.0)
     neutral = neutral and at.ratio == wp.vec3(1.0, 1.0, 1.0) and at.mirror_ball == wp.vec3(0.0, 0.0, 0.0)
     return not neutral
@@ -70,7 +70,7 @@ def is_changed(at: LayersAt) -> wp.bool:
 
 @wp.func
 def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
-    """Compose all layers over the frame's radiance; changes do not take it below 0."""
+    """Return the radiance of all layers over the frame's ``radiance``; the frame's changed radiance is at least 0."""
     physical = wp.max(wp.cw_mul(radiance, at.ratio) + at.added + at.mirror_ball, wp.vec3(0.0, 0.0, 0.0))
     return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
 

@@ -21,7 +21,7 @@ Without the ball, a is one stop above e. That is near the median of clipped pixe
 in a mirror ball (a third to half a stop at the edge, 0.4 to 1 beyond two pixels).
 
 **The ball.** The light recovered from the ball (``recover``) gives a. A core pixel that shows the ball takes the light
-from its mirror direction. A core pixel that shows a modelled surface is not an emitter: hue and depth are used. Any
+that the ball reflects. A core pixel that shows a modelled surface is not an emitter: hue and depth are used. Any
 other shows a point beyond the scene, at an unknown distance t along the pixel's ray o + t d. The ball at p sees this
 point in the direction d + (o - p) / t. With 1 / t growing from 0, the first connected run of directions whose light
 also clips in the ball is taken for the point, and its brightest texel gives a. Emitters have sharper edges than glow on
@@ -54,9 +54,9 @@ from warp_ar.kernels.structs import FrameParams, Picture, Probe, RayScene
 wp.set_module_options({"enable_backward": False})
 
 KNEE = wp.constant(wp.float32(250.0))
-"""Code above which a channel begins to count as clipped: noise and video codecs scatter around clipping."""
+"""8-bit value above which a channel is partly clipped: noise and video codecs scatter values around clipping."""
 CLIPPED = wp.constant(wp.float32(254.0))
-"""Code from which a channel counts as fully clipped."""
+"""8-bit value from which a channel is fully clipped."""
 TILE_LEVEL = 4
 """Level of the pyramid whose texels are tiles, 2^4 = 16 pixels wide."""
 _TILE_LEVEL = wp.constant(TILE_LEVEL)
@@ -67,12 +67,12 @@ LEAST_HUE = wp.constant(wp.float32(1.0 / 64.0))
 BRIGHTEST = wp.constant(wp.float32(1.0e4))
 """Upper bound of every estimate."""
 NEAREST = wp.constant(wp.float32(2.0))
-"""Largest distance between camera and ball over t: the nearest point lies at half that distance."""
+"""Largest ratio of the distance between camera and ball to the distance t of a point: bounds the search from below."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DeclipConfig:
-    """Compile-time configuration of the last kernel."""
+    """Compile-time configuration of ``complete_core``."""
 
     ball: bool = False
     """True if the light recovered from the ball is used."""
@@ -82,7 +82,7 @@ class DeclipConfig:
 
 @wp.func
 def clipping(code: wp.vec3ub) -> wp.vec3:
-    """Return the degree to which each channel counts as clipped, 0..1: 1 from ``CLIPPED`` up."""
+    """Return the degree of clipping of each channel: 0 up to ``KNEE``, 1 from ``CLIPPED`` on, linear between."""
     clipped = wp.vec3()
     for channel in range(3):
         clipped[channel] = wp.clamp((wp.float32(code[channel]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0)
@@ -91,20 +91,20 @@ def clipping(code: wp.vec3ub) -> wp.vec3:
 
 @wp.func
 def half(extent: wp.int32) -> wp.int32:
-    """Return the rows or columns of the first level, for those of the frame."""
+    """Return the rows (or columns) of the pyramid's first level, for a frame of ``extent`` rows (or columns)."""
     return (extent + 1) / 2
 
 
 @wp.func
 def hue_weight(radiance: wp.vec3) -> wp.float32:
-    """Return the weight of an unclipped pixel's hue."""
+    """Return the weight, 0..1, of the hue of an unclipped pixel of linear ``radiance``."""
     w = wp.clamp((wp.max(radiance) - DARKEST) / (1.0 - DARKEST), 0.0, 1.0)
     return w * w
 
 
 @wp.func
 def weighted_hue(radiance: wp.vec3) -> wp.vec4:
-    """Return the hue (of mean 1) times its weight, and the weight."""
+    """Return (R, G, B, weight): the hue, scaled to a mean of 1, times its weight; and the weight."""
     w = hue_weight(radiance)
     if w == 0.0:
         return wp.vec4()
@@ -191,7 +191,7 @@ def pull_level_kernel(
     # Out (and in: the finer level):
     levels_out: wp.array[wp.vec4],
 ):
-    """Sum the texels of the finer level."""
+    """Write one texel: the sum of its texels of the next finer level; 0 in inactive tiles."""
     i, j = wp.tid()
     if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
         levels_out[offset + i * columns + j] = wp.vec4()
@@ -234,7 +234,10 @@ def push_level_kernel(
     # Out (and in: the coarser level, and the sums that are replaced):
     levels_out: wp.array[wp.vec4],
 ):
-    """Turn sums into values: hue, and levels climbed. The coarsest level (no coarser rows) is completed by grey."""
+    """Replace a texel's sums by its value: hue, and levels climbed.
+
+    A texel of weight below 1 is completed from the coarser level; the coarsest level (``coarse_rows`` 0) from grey.
+    """
     i, j = wp.tid()
     if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
         return
@@ -257,7 +260,7 @@ def push_level_kernel(
 
 @wp.func
 def hue_of(filled: wp.vec4) -> wp.vec3:
-    """Return a hue whose channels are at least ``LEAST_HUE``."""
+    """Return the hue of a texel from ``fill_levels``, with channels of at least ``LEAST_HUE``."""
     return wp.vec3(wp.max(filled[0], LEAST_HUE), wp.max(filled[1], LEAST_HUE), wp.max(filled[2], LEAST_HUE))
 
 
@@ -272,7 +275,7 @@ def complete_kernel(
     # Out:
     declipped_out: wp.array2d[wp.vec3],
 ):
-    """Write the linear radiance; in active tiles, estimate clipped channels by the neighbours' hue."""
+    """Write one pixel's linear radiance; in active tiles, clipped channels are estimated by the neighbours' hue."""
     i, j = wp.tid()
     i += row_start
     if active[i >> _TILE_LEVEL, j >> _TILE_LEVEL] == 0:
@@ -294,7 +297,10 @@ def complete_kernel(
 
 @functools.cache
 def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
-    """``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: recovered light along a ray, 0 for none."""
+    """``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: recovered light along a pixel's ray.
+
+    It is 0 if the ray meets a proxy, or if no light in the ray's possible directions clips in the ball.
+    """
     trace = make_trace(TraceConfig(objects=(), proxies=config.proxies))
 
     @wp.func(module="unique")
@@ -405,7 +411,7 @@ mark_tiles = row_launcher(mark_tiles_kernel)
 
 
 def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
-    """Mark the neighbours of marked tiles too; both ``tile_shape(H, W)`` int32."""
+    """Write 1 for marked tiles and their eight neighbours, else 0; both arrays are ``tile_shape(H, W)`` int32."""
     launch(widen_tiles_kernel, active_out.shape, [marked], [active_out], device=marked.device)
 
 
@@ -413,7 +419,7 @@ pull_frame = row_launcher(pull_frame_kernel, like=lambda active, frame, *_: leve
 """Write the first level: weighted hues of unclipped pixels.
 
 Args:
-    active: Tiles from ``widen_tiles``; others are left out.
+    active: Tiles from ``widen_tiles``; texels of inactive tiles become 0.
     frame: (H, W) vec3ub, RGB.
     decode_table: (256,) vec3 of ``color.decode_table``.
     completed: (H, W) vec3 from ``complete``; if given, its pixels with at least one unclipped channel count. If None,
@@ -423,12 +429,13 @@ Args:
 
 
 def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) -> None:
-    """Sum the first level up to the coarsest, and fill values down to the first.
+    """Sum the first level up to the coarsest, then fill in missing values from the coarsest level down to the first.
 
     Args:
         active: Tiles from ``widen_tiles``.
         shape: Height and width of the frame.
-        levels_out: In: sums of weighted hue and of weights in the first level. Out: hue, and levels climbed, in all.
+        levels_out: On entry, the first level holds sums of weighted hue and of weights. On return, all levels hold hue
+            and the number of levels climbed.
     """
     shapes = level_shapes(*shape)
     offsets = [sum(map(math.prod, shapes[:level])) for level in range(len(shapes))]

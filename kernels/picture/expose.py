@@ -1,8 +1,9 @@
 """Change of the picture's exposure: shorter, as a camera reacts to added light, or longer.
 
 A shorter exposure scales linear light by s < 1. The radiance of clipped pixels is unknown, and scaling their clipped
-value gives flat grey patches. A pixel counts as clipped if all its channels are. A pixel with an unclipped channel is
-not far above clipping; brightening it would leave a bright island in a surface that fades.
+value gives flat grey patches. (A *code* is an 8-bit pixel value.) A pixel counts as clipped if all its channels are. A
+pixel with an unclipped channel is not far above clipping; brightening it would leave a bright island in a surface that
+fades.
 
 Methods:
 ``plain``: scaling alone; a clipped pixel is taken to be just clipped.
@@ -34,8 +35,8 @@ is the identity.
 Frames of more than 8 bits: means of boxes include the remainder that 8 bits cut off (``summed_area.write_cut``). A
 linear frame that stores values above 1 needs no estimate: its clipped pixels have their linear radiance.
 
-Output values end at the codes at which the camera's channels saturate, so that a highlight is no brighter than a lamp
-in the frame.
+Output codes are limited to those at which the camera's channels saturate, so that a highlight is no brighter than a
+lamp in the frame.
 
 Pixels without layers and without an estimate are mapped by a table of 256 codes, computed for each s.
 
@@ -87,7 +88,7 @@ AUTO_SECONDS = wp.constant(wp.float32(0.3))
 AUTO_STRIDE = 4
 """Distance of the pixels that ``auto`` samples, in rows and columns."""
 LEVELS = 64
-"""Bins of ``auto``: bin 0 lies below clipping, bin k from (k - 1) / 8 to k / 8 stops above it, the last one is open."""
+"""Bins of ``auto``: bin 0 lies below clipping, bin k is (k - 1) / 8 to k / 8 stops above; the last has no end."""
 
 _LEVELS = wp.constant(LEVELS)
 _AUTO_STRIDE = wp.constant(AUTO_STRIDE)
@@ -106,7 +107,7 @@ class ClippedEvidence:
 
 @wp.struct
 class Exposure:
-    """An exposure scale, and the codes that it maps codes to."""
+    """An exposure scale, and the table of output codes that it gives for the frame's codes."""
 
     encode_table: wp.array[wp.vec3]  # from ``color.encode_table``
     scale: wp.array[wp.float32]  # (1,), not negative
@@ -115,7 +116,7 @@ class Exposure:
 
 @wp.func
 def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, scale: wp.float32) -> wp.float32:
-    """Return the mean intensity, 0..255, of the box around a pixel for a scale in 0..1.
+    """Return the mean intensity, 0..255, of the box around a pixel; ``scale``, 0..1, determines the box's size.
 
     For a size between two odd numbers the means of both boxes are interpolated, so that the result is centred and
     changes continuously with the scale.
@@ -129,7 +130,7 @@ def surrounding_mean(clipped: ClippedEvidence, row: wp.int32, col: wp.int32, sca
 
 @wp.func
 def is_light(clipped: ClippedEvidence) -> wp.bool:
-    """Return whether the frame is linear and stores radiance above 1."""
+    """Return whether the frame is linear and stores radiance above 1, so that clipped pixels need no estimate."""
     return clipped.levels.shape[0] > 0 and clipped.levels[0][0] > 1.0
 
 
@@ -155,7 +156,7 @@ def expose_codes_kernel(
     # Out:
     codes_out: wp.array[wp.vec3ub],
 ):
-    """Write the code of every code after scaling."""
+    """Write the output code of one input code, whose linear value is multiplied by the scale."""
     i = wp.tid()
     codes_out[i] = encode(encode_table, scale[0] * decode_table[i])
 
@@ -167,13 +168,13 @@ def read_scale_kernel(
     # Out:
     scale_out: wp.array[wp.float32],
 ):
-    """Write the fixed scale; NaN and negative scales become 0."""
+    """Write the scene's fixed exposure scale; a NaN or negative scale becomes 0."""
     scale_out[0] = wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)
 
 
 @wp.func
 def level_of(peak: wp.float32) -> wp.int32:
-    """Return the bin of a radiance, by its largest channel ``peak``."""
+    """Return the index of the bin, of ``LEVELS``, for a radiance whose largest channel is ``peak``."""
     if not peak > 1.0:
         return 0
     return wp.min(wp.int32(wp.log2(wp.min(peak, 1.0e6)) * 8.0) + 1, _LEVELS - 1)
@@ -189,7 +190,7 @@ def count_levels_kernel(
     # Out:
     levels_out: wp.array2d[wp.int32],
 ):
-    """Count the pixels under virtual light in each level, for one sampled row."""
+    """Count, for one sampled row, the pixels under virtual light in each bin of radiance."""
     strip = row_start + wp.tid()
     for level in range(_LEVELS):
         levels_out[strip, level] = 0
@@ -215,7 +216,7 @@ def adapt_scale_kernel(
     # Out:
     scale_out: wp.array[wp.float32],
 ):
-    """Move the scale toward its target; a scale of 0 was never set."""
+    """Move the exposure scale toward its target; a scale of 0, which was never set, becomes the target."""
     total = int(0)
     for strip in range(levels.shape[0]):
         for level in range(_LEVELS):
@@ -260,7 +261,7 @@ def make_find_gain(method: str) -> wp.Function:
 
 @functools.cache
 def make_expose_kernel(method: str) -> wp.Kernel:
-    """Return the kernel of one of ``METHODS`` or ``BOXES``; equal ones share one kernel.
+    """Return the kernel of one of ``METHODS`` or ``BOXES``; calls with the same method share one kernel.
 
     Raises:
         ValueError: There is no such method.
@@ -315,7 +316,7 @@ def make_expose_kernel(method: str) -> wp.Kernel:
 
 
 def largest_box(height: int) -> int:
-    """Return ``max_box``, pixels, for a frame of ``height`` rows."""
+    """Return the side of the largest box, pixels, for a frame of ``height`` rows."""
     return max(1, round(MAX_BOX * height))
 
 
@@ -351,12 +352,12 @@ def make_exposure(encode_table: wp.array, scale: wp.array, codes: wp.array) -> E
 
 
 def read_scale(params: wp.array, scale_out: wp.array) -> None:
-    """Write the fixed scale of ``params[0]``, not below 0, to ``scale_out``, (1,) float32."""
+    """Write the fixed exposure scale of ``params[0]``, or 0 if it is negative, to ``scale_out``, (1,) float32."""
     launch(read_scale_kernel, 1, [params], [scale_out], device=params.device)
 
 
 count_levels = row_launcher(count_levels_kernel, like=lambda *given: given[-1].shape[:1])
-"""Count pixels under virtual light by their level, for ``auto``.
+"""Count the pixels under virtual light in each bin of radiance, for ``auto``.
 
 Args:
     params: (1,) FrameParams.
@@ -367,7 +368,13 @@ Args:
 
 
 def adapt_scale(params: wp.array, levels: wp.array, scale_out: wp.array) -> None:
-    """Move ``scale_out``, (1,) float32, toward its target by ``levels`` of ``count_levels``; 0 means never set."""
+    """Move the exposure scale toward the target that the counts give.
+
+    Args:
+        params: (1,) FrameParams; the time step.
+        levels: Counts from ``count_levels``.
+        scale_out: (1,) float32, changed in place; 0 on entry: it was never set, and becomes the target.
+    """
     launch(adapt_scale_kernel, 1, [params, levels], [scale_out], device=params.device)
 
 

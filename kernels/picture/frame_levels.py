@@ -33,7 +33,7 @@ LAST_LEVEL = 6
 """Coarsest level; its texels are as wide as 64 pixels."""
 LAST = wp.constant(wp.int32(LAST_LEVEL))
 MOST_TAPS = wp.constant(wp.int32(4))
-"""Largest number of reads along the longer axis of a ray's footprint."""
+"""Largest number of samples along the longer axis of a ray's footprint."""
 LEAST_COSINE = wp.constant(wp.float32(0.02))
 """Least cosine between ray and normal, to bound the footprint of a grazing ray."""
 
@@ -58,29 +58,29 @@ class Footprint:
 
 
 def level_size(height: int, width: int, level: int) -> tuple[int, int]:
-    """Return the rows and columns of a level."""
+    """Return the rows and columns of a level, for a frame of ``height`` x ``width`` pixels."""
     return -(-height >> level), -(-width >> level)
 
 
 def level_offset(height: int, width: int, level: int) -> int:
-    """Return the index of a level's first texel; level 0 is the frame itself."""
+    """Return the index of a level's first texel in the array of levels, which begins with level 1."""
     return sum(rows * columns for rows, columns in (level_size(height, width, one) for one in range(1, level)))
 
 
 def level_texels(height: int, width: int) -> int:
-    """Return the number of texels of all levels."""
+    """Return the number of texels of levels 1 to ``LAST_LEVEL``."""
     return level_offset(height, width, LAST_LEVEL + 1)
 
 
 @wp.func
 def rows_of(extent: wp.int32, level: wp.int32) -> wp.int32:
-    """Return the rows or columns of a level, for those of the frame."""
+    """Return the rows (or columns) of a level, for a frame of ``extent`` rows (or columns)."""
     return (extent + (1 << level) - 1) >> level
 
 
 @wp.func
 def start_of(height: wp.int32, width: wp.int32, level: wp.int32) -> wp.int32:
-    """Return the index of a level's first texel, in kernels."""
+    """Return the index of a level's first texel: ``level_offset`` for use in kernels."""
     start = wp.int32(0)
     for below in range(1, level):
         start += rows_of(height, below) * rows_of(width, below)
@@ -127,7 +127,7 @@ def shrink_frame_kernel(
 
 @wp.func
 def pixels_of(extent: wp.int32, level: wp.int32, index: wp.int32) -> wp.float32:
-    """Return the pixels that a texel of a level covers along one axis; fewer at the last row or column."""
+    """Return the number of pixels that texel ``index`` of a level covers along an axis of ``extent`` pixels."""
     return wp.float32(wp.min((index + 1) << level, extent) - (index << level))
 
 
@@ -216,7 +216,7 @@ def look_up_level(
     level = wp.clamp(wp.log2(wp.max(size, 1.0)), 0.0, wp.float32(LAST))
     below = wp.min(wp.int32(level), LAST - 1)
     fraction = level - wp.float32(below)
-    # A loop over the two levels, so that the code that reads a level is there once.
+    # A loop over the two levels, so that the code that reads a level is compiled once.
     last = wp.where(fraction > 0.0, below + 1, below)
     radiance = wp.vec3(0.0)
     for one in range(below, last + 1):
@@ -227,7 +227,10 @@ def look_up_level(
 
 @wp.func
 def covered_on(origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """Return the footprint dP of a ray on a surface at t, along one axis, as derived above."""
+    """Return the ray differential dP, metres, on a surface at distance t, for a step along one image axis.
+
+    ``origin`` and ``turn`` are the changes of the ray's origin and direction over that step.
+    """
     moved = origin + t * turn
     cosine = wp.dot(direction, normal)
     cosine = wp.where(cosine < 0.0, wp.min(cosine, -LEAST_COSINE), wp.max(cosine, LEAST_COSINE))
@@ -236,7 +239,10 @@ def covered_on(origin: wp.vec3, turn: wp.vec3, t: wp.float32, direction: wp.vec3
 
 @wp.func
 def shown_as(params: FrameParams, from_camera: wp.vec3, change: wp.vec3) -> wp.vec2:
-    """Return the shift, in pixels, of a point's projection by ``change``; lens distortion is ignored as small."""
+    """Return the shift in the image, (x, y) pixels, of a point that moves by ``change``, without lens distortion.
+
+    ``from_camera`` leads from the camera to the point; both are in world axes, metres.
+    """
     p = wp.transpose(params.world_from_camera) * from_camera
     d = wp.transpose(params.world_from_camera) * change
     z = wp.max(p[2], 1.0e-6)
@@ -249,7 +255,10 @@ def shown_as(params: FrameParams, from_camera: wp.vec3, change: wp.vec3) -> wp.v
 def look_up_covered(
     params: FrameParams, picture: Picture, layers: ReceiverLayers, at: wp.vec2, a: wp.vec2, b: wp.vec2
 ) -> wp.vec3:
-    """Average the picture over the ellipse of the vectors ``a`` and ``b``, pixels, around the point ``at``."""
+    """Return the picture's mean radiance over an ellipse around the point ``at``, pixels.
+
+    ``a`` and ``b``, pixels, are the footprint's vectors A and B.
+    """
     xx = a[0] * a[0] + b[0] * b[0]
     yy = a[1] * a[1] + b[1] * b[1]
     xy = a[0] * a[1] + b[0] * b[1]

@@ -40,7 +40,7 @@ def find_motion_kernel(
     # Out:
     motion_out: wp.array2d[wp.vec2],
 ):
-    """Find the motion of one pixel."""
+    """Write the motion vector of one pixel."""
     i, j = wp.tid()
     i += row_start
     motion = wp.vec2(0.0, 0.0)
@@ -67,7 +67,10 @@ def remember_kernel(
     params_out: wp.array[FrameParams],
     objects_out: wp.array[Shape],
 ):
-    """Copy one object; the first thread copies the camera, so there is at least one."""
+    """Save one object's pose per thread, for the next frame's motion vectors.
+
+    Thread 0 also saves the camera, so at least one thread is launched.
+    """
     k = wp.tid()
     if k == 0:
         params_out[0] = params[0]
@@ -90,6 +93,6 @@ Args:
 
 
 def remember(params: wp.array, scene: RayScene, params_out: wp.array, objects_out: wp.array) -> None:
-    """Copy camera and objects for ``find_motion`` in the next frame."""
+    """Save the camera and the objects' poses for ``find_motion`` in the next frame."""
     count = max(1, scene.objects.shape[0])
     launch(remember_kernel, count, [params, scene], [params_out, objects_out], device=params.device)

@@ -29,7 +29,7 @@ def trace_object_masks_kernel(
     # Out:
     masks_out: wp.array2d[wp.uint64],
 ):
-    """Test one pixel's ray against every object on its own."""
+    """Write one pixel's mask: each object is tested against the ray separately, so none hides another."""
     i, j = wp.tid()
     i += row_start
     mask = wp.uint64(0)
@@ -57,8 +57,8 @@ trace_object_masks = row_launcher(trace_object_masks_kernel)
 """Write the set of objects that the ray through each pixel's centre meets.
 
 Args:
-    params: (1,) FrameParams: camera and object_rect, outside of which no object is.
+    params: (1,) FrameParams: camera and object_rect, outside which there are no objects.
     rays: (H, W) undistorted x / z and y / z of each pixel centre.
-    scene: At most 64 objects: a pixel has a bit for each.
+    scene: At most 64 objects: a pixel's mask has one bit for each.
     masks_out: (H, W) uint64; bit k is set if the ray meets object k, whether or not another surface hides it.
 """

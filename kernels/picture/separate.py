@@ -3,9 +3,9 @@
     picture = encode(s ((1 - alpha) max(plate * shadow_ratio + added_light + mirror_ball, 0) + objects))
 
 with the exposure scale s (1 if the scene keeps the camera's exposure) and ``objects`` premultiplied by its coverage
-alpha. These are the values from which ``composite`` and ``expose`` make the picture. A layer is neutral in pixels
-outside its rectangle, where its array may hold values of an earlier frame. ``plate`` is the frame, with clipped pixels
-as the method of ``expose`` estimates them.
+alpha. ``composite`` and ``expose`` make the picture from these values. Outside a layer's rectangle, where its array may
+hold values of an earlier frame, neutral values are written. ``plate`` is the camera's frame without virtual content,
+with clipped pixels estimated by the method of ``expose``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class SeparateLayers:
 
 @functools.cache
 def make_separate_layers_kernel(method: str) -> wp.Kernel:
-    """Return the kernel for one of the methods of ``expose``; equal ones share one kernel."""
+    """Return the kernel for one of the methods of ``expose``; calls with the same method share one kernel."""
     find_gain = make_find_gain(method)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -27,9 +27,9 @@ from warp_ar.kernels.pixels import cut_luma
 wp.set_module_options({"enable_backward": False})
 
 NOT_CUT = wp.constant(wp.float32(128.0))
-"""Byte of a pixel whose remainder is 0."""
+"""Byte that encodes a remainder of 0."""
 CUT_STEPS = wp.constant(wp.float32(64.0))
-"""Steps of the byte per code; a remainder of up to two codes to either side fits."""
+"""Steps of the byte per 8-bit pixel value (code): it encodes remainders of -2 to almost 2 codes."""
 
 COLUMNS = wp.constant(4)
 """Neighbouring columns that one thread sums: memory is read in whole words, and there are enough threads."""
@@ -102,7 +102,7 @@ def write_cut_kernel(
     # Out:
     cut_out: wp.array2d[wp.vec3ub],
 ):
-    """Write one pixel's remainder as a grey, whose ``intensity`` is its code."""
+    """Write one pixel's encoded remainder as a grey, whose ``intensity`` equals its three bytes."""
     band_row, column = wp.tid()
     row = row_start + band_row
     steps = wp.round(CUT_STEPS * cut_luma(frame, decode_table, linear, row, column)) + NOT_CUT
@@ -144,7 +144,7 @@ def sum_columns_kernel(
     # Out:
     table_out: wp.array2d[wp.uint32],
 ):
-    """Replace a few columns of the rows' sums by their running sums."""
+    """Replace the sums along rows by their running sums down a few neighbouring columns."""
     first = (row_start + wp.tid()) * COLUMNS
     stop = wp.min(first + COLUMNS, table_out.shape[1])
     for i in range(1, table_out.shape[0]):
@@ -167,7 +167,12 @@ def column_groups(width: int) -> int:
 
 
 def sum_columns(table_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Sum the columns of ``sum_rows``, in place; ``rows`` is a band of ``column_groups``, None means all."""
+    """Write the running sums down each column, in place: the second pass.
+
+    Args:
+        table_out: (H, W) uint32, from ``sum_rows``.
+        rows: Band of threads, of ``column_groups(W)``; None means all.
+    """
     shape = (column_groups(table_out.shape[1]),)
     launch_rows(sum_columns_kernel, shape, [], [table_out], rows=rows, device=table_out.device)
 

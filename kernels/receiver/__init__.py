@@ -1,1 +1,1 @@
-"""Kernels of the real surfaces: virtual light and shadows on them, and the light that they lose."""
+"""Kernels of real surfaces (receivers): virtual light, shadows and reflections of virtual objects on them."""

@@ -9,9 +9,10 @@ both: they are real, and their shadows are in the frame. Both are sums over the 
 (``environment_samples``). So the ratio is exactly 1 where no object hides light, 0 where a point sees only a black
 object, and errors of the samples cancel to first order.
 
-Cells. The ratio is estimated at one pixel of every ``stride x stride``. The cells of a tile of ``side x side`` use one
-set of samples each, all sets differing. ``environment_shadow_filter`` then averages over as many cells as a tile has,
-so that each set counts the same [KH01]. The result depends on the current frame alone: it does not flicker or lag.
+Cells. A cell is a block of ``stride x stride`` pixels; the ratio is estimated at one of them. Each cell of a tile of
+``side x side`` cells has its own set of samples. ``environment_shadow_filter`` then averages over as many cells as a
+tile has, so that each set has the same weight [KH01]. The result depends on the current frame alone: it does not
+flicker or lag.
 
 Culling. Only rays whose direction meets the bounding sphere of an object, by a dot product, are traced for objects.
 Cells without such samples have a ratio of 1.
@@ -64,7 +65,7 @@ from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Hit, Picture, RaySc
 wp.set_module_options({"enable_backward": False})
 
 CHUNK = wp.constant(64)
-"""Samples that are culled together, one bit of a mask each."""
+"""Number of samples that are culled together; each has one bit of a mask."""
 TILE_ROWS, TILE_COLUMNS = wp.constant(4), wp.constant(8)
 """Rows and columns of cells that a CUDA warp computes."""
 QUEUED_REGISTERS = 128
@@ -74,7 +75,7 @@ MAX_QUEUE = 1 << 24
 MAX_PARTIALS = 8
 """Largest number of CUDA threads that share a cell's samples, each with a partial sum."""
 ENOUGH_THREADS = 1 << 20
-"""Number of threads above which a CUDA device gets slower: each finds the cell's point and culls its samples anew."""
+"""Number of threads from which more threads per cell are slower: each thread repeats the cell's set-up and culling."""
 QUEUE_THREADS = 1 << 17
 """Threads that trace the queue; each takes every ``QUEUE_THREADS``-th ray."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
@@ -98,7 +99,7 @@ class EnvironmentShadowConfig:
     bounce: Literal["estimated", "traced"]
     """Method by which light from objects onto the receiver is found."""
     secondary: float = 1.0
-    """Share of a set, its first samples, whose rays find the light of an object that they meet; others stop there."""
+    """Share of a set's samples, from its first, for which the light of the object that their ray meets is found."""
     emitters: bool = False
     """True if some samples are emitters at a known distance."""
     partials: int = 1
@@ -118,7 +119,7 @@ class EnvironmentShadowConfig:
 
     @property
     def secondary_count(self) -> int:
-        """Samples of a set that send secondary rays."""
+        """Number of a set's samples that send secondary rays."""
         return round(self.count * self.secondary)
 
 
@@ -157,7 +158,14 @@ def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
 
 @wp.func
 def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.vec3) -> wp.vec3:
-    """Return the light of objects over the environment's; ``returned`` is the part that the receiver sent them."""
+    """Return the irradiance that objects reflect to a point, over that of the environment, per channel.
+
+    Args:
+        without: Irradiance of the environment without objects.
+        hidden: Part of ``without`` that objects hide.
+        sent: Irradiance by light of the environment that objects reflect.
+        returned: Irradiance by light of an unshaded receiver that objects reflect.
+    """
     ratio = wp.vec3(0.0)
     for channel in range(3):
         if without[channel] > MIN_IRRADIANCE:
@@ -170,7 +178,7 @@ def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.ve
 
 @wp.func
 def first_of_set(i: wp.int32, j: wp.int32, side: wp.int32, count: wp.int32) -> wp.int32:
-    """Return the first sample of a cell's set; ``count`` is the number of samples of all sets."""
+    """Return the index of the first sample of the set of cell (i, j); ``count`` is the number of all sets' samples."""
     return count / (side * side) * ((i % side) * side + j % side)
 
 
@@ -189,7 +197,10 @@ def may_be_one_sided(objects: wp.array[Shape]) -> wp.bool:
 
 @wp.func
 def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
-    """Return the value of w . to_center above which a unit direction w meets the sphere; all do from inside."""
+    """Return the least value of w . to_center for which a ray along the unit direction w meets a sphere.
+
+    ``to_center`` leads from the ray's origin to the sphere's centre. Inside the sphere every ray meets it: -FAR.
+    """
     squared = wp.dot(to_center, to_center) - radius * radius
     if squared <= 0.0:
         return -FAR
@@ -198,7 +209,7 @@ def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
 
 @functools.cache
 def make_mask_cone(count: int, emitters: bool) -> wp.Function:
-    """``mask_cone(sets, first, point, to_center, radius) -> uint64``: bits of the samples that point at a sphere."""
+    """``mask_cone(sets, first, point, to_center, radius) -> uint64``: mask of samples in a sphere's direction."""
 
     @wp.func(module="unique")
     def mask_cone(
@@ -281,7 +292,10 @@ class SampleRay:
 
 @functools.cache
 def make_aim(emitters: bool, several: bool = False) -> wp.Function:
-    """``aim(sets, places, index, hit) -> SampleRay``, without origin; ``places`` of the balls, if ``several``."""
+    """``aim(sets, places, index, hit) -> SampleRay``: ray from ``hit`` toward sample ``index``, its origin not set.
+
+    ``places`` holds the balls' positions, and is read if ``several``.
+    """
 
     @wp.func(module="unique")
     def aim(sets: SampleSets, places: wp.array[wp.vec4], index: wp.int32, hit: Hit) -> SampleRay:
@@ -314,8 +328,8 @@ class Sender:
 def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
     """``find_sender(params, picture, scene, distant, sets, index, ray, by_proxy, by_ball) -> Sender``.
 
-    It is the sample itself, or a physical surface before it: a proxy is looked for if ``by_proxy``, a mirror ball if
-    ``by_ball``.
+    The source is the first proxy (sought if ``by_proxy``) or mirror ball (sought if ``by_ball``) on the ray, else the
+    sample of the environment.
     """
     closest_proxy = make_trace(config.distant.trace).closest_proxy
     traced = config.bounce == "traced"
@@ -375,10 +389,11 @@ def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
 
 # The threads of a warp compute cells that share a set of samples, so that their rays have the same directions. The
 # cells are close together, so that the rays meet similar surfaces: TILE_ROWS x TILE_COLUMNS cells, ``side`` apart. The
-# next warps compute the cells of the other sets there. After all cells follow those of the next partial sum.
+# next warps compute the cells of the other sets in that area. The threads of one partial sum of all cells are followed
+# by those of the next partial sum.
 @wp.func
 def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, extent: wp.vec2i) -> wp.vec3i:
-    """Return row and column of a thread's cell, and the index of its partial sum; ``extent`` from ``tiled_shape``."""
+    """Return (row, column, partial): a thread's cell and partial sum; ``extent`` is from ``tiled_shape``."""
     number = i % extent[0] * extent[1] + thread
     lane = number % (TILE_ROWS * TILE_COLUMNS)
     one_of = number / (TILE_ROWS * TILE_COLUMNS) % (side * side)
@@ -390,14 +405,17 @@ def tiled_cell(i: wp.int32, thread: wp.int32, side: wp.int32, extent: wp.vec2i) 
 
 
 def tiled_shape(rows: int, columns: int, side: int) -> tuple[int, int]:
-    """Return the rows and columns of threads for so many cells, rounded up to whole tiles of ``tiled_cell``."""
+    """Return the rows and columns of threads for ``rows`` x ``columns`` cells, rounded up to whole tiles."""
     down, across = side * int(TILE_ROWS), side * int(TILE_COLUMNS)
     return -(-rows // down) * down, -(-columns // across) * across
 
 
 @wp.func
 def queue_rays(found: wp.uint64, begin: wp.int32, size: wp.int32, cell: wp.int32, queue_out: ShadowQueue) -> wp.vec2i:
-    """Queue the rays of a cell whose bits are set, of samples from ``begin`` on; return the first's index and count."""
+    """Queue a cell's rays for the bits set in ``found``, and return the index of the first and their number.
+
+    Bit k stands for sample ``begin`` + k of the cell's set; ``size`` is the number of bits.
+    """
     count = wp.int32(0)
     for k in range(size):
         if (found & (wp.uint64(1) << wp.uint64(k))) != wp.uint64(0):
@@ -560,7 +578,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
 
 
 def _threads(*given: Any) -> tuple[int, int]:
-    """Return the shape of a launch: that of the cells, or of all partial sums if rays are queued."""
+    """Return the rows and columns of threads: one per cell, or one per partial sum if rays are queued."""
     cells, queue = given[-2:]
     if queue.spans is None:
         return cells.surface.shape
@@ -568,7 +586,7 @@ def _threads(*given: Any) -> tuple[int, int]:
 
 
 shade_environment = row_launcher(make_environment_shadow_kernel, outputs=2, like=_threads)
-"""Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
+"""Estimate the ratio at one pixel of each cell (block of ``stride x stride`` pixels), with one set of samples.
 
 Args:
     config: Features of the scene.
@@ -585,7 +603,7 @@ Args:
 
 @functools.cache
 def make_trace_queue_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
-    """Kernel that finds the light of objects along the queued rays."""
+    """Kernel that finds the light that objects reflect along the queued rays."""
     secondary_count, side = config.secondary_count, config.side
     aim = make_aim(config.emitters, config.distant.several)
     closest_object = make_trace(config.distant.trace).closest_object
@@ -620,7 +638,7 @@ def make_trace_queue_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
             ray = aim(sets, distant.others.places, index, hit)
             ray.origin = offset_origin(hit.point, hit.geometric_normal, ray.direction, hit.error)
             reflected = ReflectedLight()
-            # Rays are queued only where an object is nearer than all physical surfaces: no others are traced.
+            # A ray is queued only if an object is nearer than all physical surfaces: only objects are traced here.
             other = closest_object(scene, ray.origin, ray.direction, FAR)
             if other.shape >= 0:
                 weight = ray.cosine * ray.grown * sets.samples[index].measure
@@ -646,7 +664,7 @@ def reduce_cells_kernel(
     # Out:
     cells_out: ShadowCells,
 ):
-    """Add partial sums in the order of the samples, which does not depend on threads: the same bits in every run."""
+    """Add a cell's partial sums in the order of the samples, so that every run gives the same bits."""
     i, j = wp.tid()
     if queue.spans[0, i, j][1] < 0:
         return
@@ -666,7 +684,7 @@ def reduce_cells_kernel(
 
 
 def count_partials(rows: int, columns: int) -> int:
-    """Return the threads per cell that fill a CUDA device: a power of 2, up to ``MAX_PARTIALS``."""
+    """Return the number of threads per cell that fills a CUDA device: a power of 2, at most ``MAX_PARTIALS``."""
     partials = MAX_PARTIALS
     while partials > 1 and partials * rows * columns > ENOUGH_THREADS:
         partials //= 2
@@ -674,7 +692,10 @@ def count_partials(rows: int, columns: int) -> int:
 
 
 def make_queue(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> ShadowQueue | None:
-    """Allocate a queue for so many cells; None if a cell has more than ``CHUNK`` samples, or the queue is too long."""
+    """Allocate a queue for ``rows`` x ``columns`` cells.
+
+    Return None if a set has more than ``CHUNK`` samples, or the queue would exceed ``MAX_QUEUE``.
+    """
     size = rows * columns * config.secondary_count
     if config.count > CHUNK or size > MAX_QUEUE:
         return None
@@ -688,7 +709,7 @@ def make_queue(config: EnvironmentShadowConfig, rows: int, columns: int, device:
 
 
 def shade_by_queue(config: EnvironmentShadowConfig, *given: Any) -> None:
-    """Estimate the ratio as ``shade_environment`` does, with the same arguments, by the queue of ``make_queue``."""
+    """Estimate the ratio with queued secondary rays; arguments as for ``shade_environment``."""
     cells, queue = given[-2:]
     device, threads = queue.items.device, min(queue.items.shape[0], QUEUE_THREADS)
     queue.length.zero_()

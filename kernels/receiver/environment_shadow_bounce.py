@@ -50,19 +50,19 @@ from warp_ar.kernels.structs import SPHERE, FrameParams, Hit, Picture, RayScene,
 wp.set_module_options({"enable_backward": False})
 
 CAUSTIC_ALPHA = wp.constant(wp.float32(0.35))
-"""Least width alpha of an object's lobe for light on the receiver, near the object.
+"""Least GGX width alpha of an object's lobe when it lights a nearby point of the receiver.
 
 A mirror's caustic on the receiver is too fine for the few rays, and would come out as specks. The wider lobe blurs it
 and keeps its energy. Far from the object fewer rays meet it and each stands for a larger part of it, so the width grows
 with the distance over the object's size.
 """
 MAX_BRIGHTNESS = wp.constant(wp.float32(2.0))
-"""Largest estimated radiance of an object, over the mean radiance of the surroundings before the cell's surface.
+"""Upper bound of an object's estimated radiance, over the mean radiance in the hemisphere above the cell's surface.
 
 An emitter may light a small part of an object that few samples meet: brighter values would show as specks.
 """
 FURTHER = wp.constant(wp.float32(0.5))
-"""Factor on the light of an object close above the receiver: half of its surroundings is its own shadow."""
+"""Factor on the light of an object close above the receiver: half of what lights the object is its own shadow."""
 
 
 @wp.func
@@ -81,12 +81,12 @@ def caustic_alpha(shape: Shape, point: wp.vec3) -> wp.float32:
 
 @wp.struct
 class Meeting:
-    """Place at which a ray from the receiver met an object, and the weight of light from there."""
+    """Point at which a ray from the receiver meets an object, and the weight of the object's radiance."""
 
     hit: Hit
     direction: wp.vec3
     alpha: wp.float32  # least width of the object's lobe
-    stands_for: wp.float32  # weight of its radiance; of all samples that the ray stands for
+    stands_for: wp.float32  # weight of the radiance, summed over all samples that the ray represents
 
 
 @wp.func
@@ -102,15 +102,15 @@ def meet_object(scene: RayScene, other: Hit, point: wp.vec3, direction: wp.vec3,
 
 @wp.struct
 class ReflectedLight:
-    """Light that objects reflect to a point of the receiver, times its weight."""
+    """Weighted radiance that objects reflect to a point of the receiver, by its origin."""
 
-    sent: wp.vec3  # light of the environment
-    returned: wp.vec3  # light that the receiver sent them
+    sent: wp.vec3  # light that came from the environment
+    returned: wp.vec3  # light that came from the receiver
 
 
 @wp.struct
 class Before:
-    """Surroundings in front of a cell's surface, for estimates without a ray."""
+    """Light of the hemisphere above a cell's surface, for estimates without a further ray."""
 
     up: wp.vec3  # the surface's normal, on the side that light comes from
     from_receiver: wp.vec3  # irradiance of a surface that faces the receiver
@@ -120,7 +120,7 @@ class Before:
 
 @functools.cache
 def make_look_wide(config: DistantLightConfig) -> wp.Function:
-    """``look_wide(environment, point, direction) -> vec3``: the environment blurred for few rays.
+    """``look_wide(environment, point, direction) -> vec3``: radiance of the environment, blurred to suit few rays.
 
     Emitters are in the directions in which the balls show them.
     """
@@ -144,7 +144,7 @@ def make_look_wide(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
-    """``reflect_estimated(distant, meeting, surface, before, so_far)``: both lobes reflect the distant environment.
+    """``reflect_estimated(distant, meeting, surface, before, so_far)``: ``so_far`` plus estimated light of both lobes.
 
     The glossy lobe has at least the width ``meeting.alpha``. The receiver fills the directions below ``before.up``.
     Radiance is limited to ``before.brightest``.
@@ -161,7 +161,7 @@ def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
         wo = -meeting.direction
         normal = hit.normal
         of_environment = wp.vec3(0.0)
-        of_receiver = wp.vec3(0.0)  # light that it would reflect of a receiver without shadows
+        of_receiver = wp.vec3(0.0)  # light that the object would reflect of a receiver without shadows
         if wp.static(config.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
             if wp.static(config.textures):
@@ -193,9 +193,9 @@ def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
-    """``reflect_traced(params, picture, scene, distant, meeting, surface, seed, so_far)``: by one ray into one lobe.
+    """``reflect_traced(params, picture, scene, distant, meeting, surface, seed, so_far)``: ``so_far`` plus light.
 
-    The glossy lobe is at least ``meeting.alpha`` wide. It is a Monte-Carlo estimate.
+    The light is a Monte-Carlo estimate by one ray into one lobe. The glossy lobe is at least ``meeting.alpha`` wide.
     """
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
@@ -246,7 +246,7 @@ def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
         if is_rough and (proxy.shape >= 0 or other.shape < 0):
             received = distant_irradiance(distant, hit.point, normal) / wp.pi
         if proxy.shape >= 0:
-            # Light of the receiver, in full if a ray from there leaves the scene.
+            # The receiver counts as fully lit if a ray from the point on it leaves the scene.
             up = proxy.geometric_normal
             if wp.dot(up, wi) > 0.0:
                 up = -up
@@ -277,7 +277,7 @@ def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_look_before(config: DistantLightConfig) -> wp.Function:
-    """``look_before(environment, point, normal, direction) -> Before``: for a surface that ``direction`` leaves."""
+    """``look_before(environment, point, normal, direction) -> Before``: light on ``direction``'s side."""
     distant_irradiance = make_distant_irradiance(dataclasses.replace(config, emitters=False))
 
     @wp.func(module="unique")
@@ -298,8 +298,8 @@ def make_look_before(config: DistantLightConfig) -> wp.Function:
 def make_reflect_back(config: DistantLightConfig, traced: bool) -> wp.Function:
     """``reflect_back(params, picture, scene, distant, met, before, seed, so_far) -> ReflectedLight``.
 
-    It adds the light that an object reflects to ``so_far``: found by another ray if ``traced``, else estimated from
-    the surroundings ``before`` the receiver.
+    The result is ``so_far`` plus the light that the object reflects. The light is found by another ray if ``traced``,
+    else it is estimated from ``before``.
     """
     surface_at = make_surface(config.models, config.textures)
     reflect_traced = make_reflect_traced(config) if traced else None

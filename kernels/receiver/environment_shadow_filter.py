@@ -1,10 +1,11 @@
 """Filter of the environment shadow's cells, and interpolation to pixels.
 
-The filter is a mean over a window of ``side + 1`` cells squared, edge cells at half weight, so it is centred and counts
-each set of samples the same. A window half as wide has half the blur and twice the noise; its mean is used where the
-two means differ by more than noise: at contacts and at the edges of an emitter's shadow. Few cells of many samples,
-filtered so, have a smaller error than many cells of few samples at twice the rays. Cells on other surfaces are left
-out. A pixel between cells of several surfaces interpolates the cells of its own surface.
+A cell is a block of pixels with one estimate. The filter is a mean over a window of ``side + 1`` cells squared, edge
+cells at half weight, so it is centred and gives each set of samples the same weight. A window half as wide has half the
+blur and twice the noise. Its mean is used where the two means differ by more than noise: at contacts and at the edges
+of an emitter's shadow. With this filter, few cells of many samples have a smaller error than many cells of few samples
+and twice the rays. Cells on other surfaces are left out. A pixel between cells of several surfaces interpolates the
+cells of its own surface.
 
 Ratios within ``NEGLIGIBLE`` of 1 are set to exactly 1.
 """
@@ -58,9 +59,9 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         # Out:
         cells_out: ShadowCells,
     ):
-        """Average neighbours on the same surface over a window of a tile's size, or half as wide where means differ.
+        """Average a cell's neighbours on the same surface, over a window of a tile's size or one half as wide.
 
-        The hidden light decides between them: light that objects bounce is too noisy.
+        The window is chosen by the means of hidden light alone: light that objects bounce is too noisy.
         """
         i, j = wp.tid()
         i += row_start
@@ -102,7 +103,7 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         mean = left + far_sent / far_left[3]
         if wp.static(wide > 1):
             sharp = wp.vec3(near_left[0], near_left[1], near_left[2]) / near_left[3]
-            # The variance of cells is that of noise, or of the middle of an edge, where both means agree.
+            # The cells' variance is due to noise, or to an edge. At the middle of an edge both means agree.
             count = near_left[3]
             spread = wp.vec3(squares[0], squares[1], squares[2]) / count - wp.cw_mul(sharp, sharp)
             error = wp.sqrt(wp.max(wp.max(spread), 0.0) / count)
@@ -117,7 +118,10 @@ def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
 
 @wp.func
 def between_surfaces(surface: wp.array2d[wp.int32], row: wp.int32, column: wp.int32) -> wp.vec2i:
-    """Return the surface of the first of four cells around a place, and 1 if another cell's differs, else 0."""
+    """Return (key, differs): the first cell's surface, and 1 if one of the other three shows another, else 0.
+
+    The four cells have the corner (row, column) and the next row and column.
+    """
     key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
     mixed = wp.bool(False)
     for corner in range(1, 4):
@@ -129,7 +133,7 @@ def between_surfaces(surface: wp.array2d[wp.int32], row: wp.int32, column: wp.in
 
 @wp.func
 def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float32) -> wp.vec3:
-    """Interpolate the ratio to a pixel, bilinearly among cells on its surface."""
+    """Return the ratio at (y, x), in cells, bilinearly interpolated among cells that show the surface ``key``."""
     filtered = cells.filtered
     surface = cells.surface
     row = wp.int32(wp.floor(y))
@@ -174,7 +178,7 @@ def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
         # Out:
         shadow_ratio_out: wp.array2d[wp.vec3],
     ):
-        """Interpolate a run of pixels of one row; pixels between surfaces trace a ray to find their own."""
+        """Interpolate a run of pixels of one row; between several surfaces, a ray finds the pixel's own."""
         i, place = wp.tid()
         rect = params[0].shadow_rect
         begin = place * run

@@ -69,16 +69,16 @@ EDGE_SAMPLES = 4
 MOST_RADIANCE = wp.constant(wp.float32(8.0))
 """Largest radiance of one ray of a rough receiver; it suppresses speckles of mirrored highlights."""
 LEAST = wp.constant(wp.float32(2.0e-4))
-"""Least radiance of a highlight that is computed; a step of 8-bit codes is at least 3e-4."""
+"""Radiance below which a highlight is not computed: the least step between 8-bit values is 3e-4."""
 LEAST_SHADOW = wp.constant(wp.float32(0.01))
-"""Least darkening by a shadow, as a share of the frame, at which mirrored light is restored."""
+"""Least change of the frame by a shadow, as a share, at which the specular part of its radiance is restored."""
 SMOOTHED = wp.constant(2)
-"""Pixels to each side over which a rough receiver is averaged."""
+"""Half width, pixels, of the window over which the change of a rough receiver is averaged."""
 
 
 @wp.struct
 class Gloss:
-    """Mirror reflection of a proxy's surface."""
+    """Specular material of a proxy's surface."""
 
     reflectance: wp.vec3  # F0, specular reflectance at normal incidence; 0: the proxy is matt
     roughness: wp.float32  # perceptual; alpha is its square
@@ -99,7 +99,7 @@ class GlossConfig:
     trace: TraceConfig
     """Kinds of shape in the scene."""
     samples: int
-    """Rays per pixel of a rough receiver."""
+    """Rays per pixel into the lobe of a rough receiver."""
     lights: tuple[int, ...] = ()
     """Sorted kinds of virtual light."""
     shade: ShadeConfig | None = None
@@ -148,9 +148,10 @@ class Reflected:
 
 @functools.cache
 def make_follow(config: GlossConfig) -> wp.Function:
-    """``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Reflected``: along one reflected ray.
+    """``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Reflected``: radiance along one ray.
 
-    ``width`` is the lobe width alpha that one ray stands for. If ``asked``, ``Reflected.before`` is always found.
+    The ray leaves ``hit`` along ``wi`` and represents a lobe of width alpha ``width``. ``Reflected.before`` is always
+    found if ``asked``, else only if an object is met.
     """
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
@@ -232,9 +233,9 @@ def make_follow(config: GlossConfig) -> wp.Function:
 def sphere_over_point(
     normal: wp.vec3, half: wp.vec3, cos_d: wp.float32, roughness: wp.float32, reach: wp.float32
 ) -> wp.float32:
-    """Return the ratio of the highlight of a sphere to that of a point light at its centre.
+    """Return a spherical light's highlight over that of a point light of the same irradiance at its centre.
 
-    ``reach`` is the sphere's radius over its distance.
+    ``half`` is the half vector, ``cos_d`` its cosine with the ray, ``reach`` the sphere's radius over its distance.
     """
     alpha = wp.max(roughness * roughness, MIN_ALPHA)
     cross = wp.cross(normal, half)
@@ -293,7 +294,7 @@ class GlossPoint:
 
 @functools.cache
 def make_see_receiver(config: GlossConfig) -> wp.Function:
-    """``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: glossy receiver at the centre of pixel (i, j)."""
+    """``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: first surface in pixel (i, j), if it is glossy."""
     closest_proxy = make_trace(config.trace).closest_proxy
 
     @wp.func(module="unique")
@@ -312,7 +313,7 @@ def make_see_receiver(config: GlossConfig) -> wp.Function:
         at.alpha = at.surface.roughness * at.surface.roughness
         at.wo = -wp.normalize(seen)
         if wp.max(at.surface.reflectance) <= 0.0 or wp.dot(hit.geometric_normal, at.wo) <= 0.0:
-            return at  # matt, or seen from behind
+            return at  # not glossy, or seen from behind
         if wp.dot(hit.normal, at.wo) <= 0.0 or meets_probe(sight.probes, origin, seen, hit.t):
             return at
         at.hit = hit
@@ -334,7 +335,7 @@ class GlossRay:
 
 @wp.func
 def draw_facet(ray: GlossRay, u: wp.vec2, wo: wp.vec3, alpha: wp.float32) -> GlossRay:
-    """Aim a ray by a visible facet, drawn from the point ``u`` of the unit square."""
+    """Return the ray reflected at a visible microfacet, which is drawn by ``u``, a point of the unit square."""
     out = ray
     basis = frame_from_normal(ray.hit.normal)
     local = wp.transpose(basis) * wo
@@ -477,7 +478,10 @@ def smooth_gloss_kernel(
     # Out:
     reflected_out: wp.array2d[wp.vec3],
 ):
-    """Average the change over neighbours on the same rough surface, whose rays differ; mirrors are not averaged."""
+    """Average one pixel's change over neighbours on the same rough surface, which traced other rays.
+
+    Mirrors are not averaged.
+    """
     i, j = wp.tid()
     i += row_start
     result = change[i, j]

@@ -35,7 +35,7 @@ from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 wp.set_module_options({"enable_backward": False})
 
 MIN_REFLECTANCE = wp.constant(wp.float32(0.05))
-"""Least reflectance of a mirror ball, by which a pixel's radiance is divided."""
+"""Lower bound of a mirror ball's reflectance: a pixel's radiance is divided by it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,7 @@ class BallRay:
 
 @functools.cache
 def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
-    """``reflect_at_ball(scene, probes, origin, direction) -> BallRay``: at the ball that a camera's ray meets first."""
+    """``reflect_at_ball(scene, probes, origin, direction) -> BallRay``: a camera's ray, reflected at the first ball."""
     occluded_by_proxies = make_trace(config.trace).occluded_by_proxies
 
     @wp.func(module="unique")
@@ -108,7 +108,7 @@ def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
 
 @functools.cache
 def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
-    """``mirrored_change(...) -> vec3``: change of a pixel's radiance, by one sample with the ray ``direction``."""
+    """``mirrored_change(...) -> vec3``: change of a pixel's radiance, found for one camera ray along ``direction``."""
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     reflect_at_ball = make_reflect_at_ball(config)
@@ -146,7 +146,7 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
         rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
         if wp.static(config.shade is not None):
             if item.shape >= 0:
-                # A pixel's rays leave the ball turned by twice the angle between the normals where they meet it.
+                # Reflection turns two rays of a pixel apart by twice the angle between the ball's normals there.
                 spread = seen.width / wp.max(item.t, 1.0e-6) + 2.0 * seen.width / probe.radius
                 radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j), spread)
                 return wp.cw_mul(rho, radiance) - shown
@@ -210,9 +210,9 @@ Args:
     params: (1,) FrameParams: camera and ball_rect.
     scene: Objects and proxies.
     lights: (n,) Light.
-    distant: The environment, as ``shade`` reads it; empty if ``config.shade`` is None.
+    distant: The environment that lights objects; empty if ``config.shade`` is None.
     receiver: From ``make_receiver``; picture and probes are always needed.
     shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
-    side: Square root of the rays per pixel, spread as ``shade`` does along edges; all values share one kernel.
+    side: Square root of the number of rays per pixel; all values share one kernel.
     mirrored_out: (H, W) vec3, change of linear radiance in camera values.
 """

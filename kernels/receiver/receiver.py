@@ -1,4 +1,4 @@
-"""The receiver: the material of a point of a physical surface, and its response to virtual light.
+"""The receiver (a physical surface that virtual light reaches): its material and its response to that light.
 
 A light of irradiance E_v (facing it) that arrives along wi adds to a pixel's radiance
 
@@ -11,7 +11,7 @@ method                    Kd                                                    
 ========================  =========================================================  =============================
 ``flat``                  a grey constant                                            N.L
 ``paper``                 a grey constant                                            (1), the letter of [DH04]
-``reflectance``           what the camera sees over what the environment sends, (2)  N.L
+``reflectance``           radiance in the frame over the environment's irradiance, (2)  N.L
 ========================  =========================================================  =============================
 
 ``flat`` equals plain alpha blending of a lit proxy. Each equation stands above its function. ``make_find_matter`` finds
@@ -67,7 +67,7 @@ READINGS: Mapping[str, Reading] = MappingProxyType(
         "paper_weighted": Reading(weighted=True),
     }
 )
-"""Ways to take equation (1), by name: the method, and readings that docs/paper.md compares with it."""
+"""Readings of equation (1), by name: that of the method ``paper``, and those that docs/paper.md compares with it."""
 DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
 """Reflectance of an unknown receiver: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
 PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
@@ -83,13 +83,13 @@ class RelightConfig:
     trace: TraceConfig
     """Kinds of shape in the scene."""
     irradiance: Literal["sh", "map"] = "sh"
-    """Form of the environment's irradiance, for ``reflectance``."""
+    """Form of the environment's irradiance, for ``reflectance``: spherical harmonics or a latlong map."""
     soft: bool = False
     """True if lights with a radius cast soft shadows; shadows of mirror balls stay hard."""
     emitters: bool = False
     """True if ``reflectance`` uses the positions of the environment's emitters."""
     ambient_visibility: bool = False
-    """True if ``reflectance`` uses the share of the environment that reaches a point."""
+    """True if ``reflectance`` reduces the irradiance to the share of the environment that is not hidden."""
     bounced: bool = False
     """True if light that lit proxies send to each other is added."""
     edge_samples: int = 1
@@ -97,12 +97,12 @@ class RelightConfig:
     several: bool = False
     """True if the light of several mirror balls is interpolated."""
     area_samples: int = 0
-    """Samples of emitting objects, per point; ``area_lights.POINT_SAMPLES``: as point lights; 0: nothing emits."""
+    """Samples of emitting objects per point; ``area_lights.POINT_SAMPLES``: they are point lights; 0: none emits."""
     area_cells: bool = False
     """True if light of emitting objects is estimated per cell; False if it is estimated at each pixel."""
 
     def general(self, *, soft: bool) -> RelightConfig:
-        """Return the configuration for any kinds of shape in the scene, with soft shadows if ``soft``."""
+        """Return this configuration with code for every kind of shape, and for soft shadows if ``soft``."""
         return dataclasses.replace(self, trace=self.trace.general(), soft=soft)
 
     def __post_init__(self) -> None:
@@ -114,7 +114,7 @@ class RelightConfig:
 
 @wp.func
 def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Return the linear interpolation of [DH04]'s fragment shader as printed, at least 0."""
+    """Return the response by the linear interpolation of the shader printed in [DH04], at least 0."""
     return wp.max((1.0 - alpha) * n_dot_l + alpha * multiplicative, 0.0)
 
 
@@ -132,7 +132,7 @@ def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.f
 # lights end as plain blending, but names no step of the shader. docs/paper.md compares the other readings.
 @wp.func
 def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Equation (1), [DH04] section 4.2."""
+    """Return the response by equation (1), [DH04] section 4.2; ``intensity`` is the multiplicative factor m."""
     weight = wp.min(wp.abs(alpha), 1.0)
     multiplicative = wp.where(alpha > 0.0, intensity, 1.0 - intensity)
     return (1.0 - weight) * n_dot_l + weight * multiplicative
@@ -180,7 +180,7 @@ class Receiver:
 
 @wp.func
 def frame_size(receiver: Receiver) -> wp.vec2i:
-    """Return rows and columns of the frame."""
+    """Return (rows, columns) of the frame."""
     return wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
 
 
@@ -196,7 +196,11 @@ class Matter:
 
 @functools.cache
 def make_find_matter(config: RelightConfig) -> wp.Function:
-    """``find_matter(receiver, hit, key, row, col, mirror) -> Matter``; ``key`` is the hit's ``surface_key``."""
+    """``find_matter(receiver, hit, key, row, col, mirror) -> Matter``: material of a point of the receiver.
+
+    ``key`` is the hit's ``surface_key``. The pixel (row, col) shows the hit directly if ``mirror`` is zero, else
+    reflected in a ball of reflectance ``mirror``.
+    """
     method, reading = config.method, READINGS.get(config.method)
     irradiance_at = make_irradiance_at(config.irradiance, config.emitters, config.several)
 
@@ -282,7 +286,7 @@ def make_receiver(
     others: OtherBalls | None = None,
     cells: ReceiverCells | None = None,
 ) -> Receiver:
-    """Return the receiver as kernels read it. Arguments that the method does not use may be None.
+    """Return the ``Receiver`` of these arrays. Arguments that the method does not use may be None.
 
     Args:
         config: Method and forms of light.

@@ -1,6 +1,6 @@
 """Light on the receiver that varies slowly over pixels, estimated per cell (block of pixels) of the frame.
 
-``relight`` interpolates the results between cells.
+``relight`` interpolates the results between cells. The receiver is the real surface that virtual light reaches.
 
 **Ambient visibility.** The receiver's reflectance is its radiance in the frame over the environment's irradiance
 (``receiver``, equation 2). The filtered irradiance ignores occlusion: in the shadow of the ball or of a box it is too
@@ -68,11 +68,11 @@ MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 256.0))
 """Ratio of bounced to environment light that is treated as 0: at most half an 8-bit code."""
 MIN_FACING = wp.constant(wp.float32(0.02))
-"""Least cosine by which the area of a patch is divided: at smaller ones it would reach over the horizon."""
+"""Least cosine by which the area of a patch is divided: bounds the area of a patch seen at a grazing angle."""
 
 
 MARGIN = wp.constant(2)
-"""Cells outside the rectangle of lit pixels that are estimated, too: its pixels interpolate."""
+"""Number of rows and columns of cells around the rectangle of lit pixels that interpolation may read."""
 
 
 @wp.struct
@@ -99,7 +99,7 @@ def visible_shares_of(lost: wp.vec3, whole: wp.vec3) -> wp.vec3:
 
 @wp.func
 def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool:
-    """Return whether a direction leads from a point into the ball around ``away``, or the point is in it."""
+    """Return whether a ray meets a ball or starts in it; ``away`` leads from its origin to the ball's centre."""
     beside = wp.dot(away, away) - radius * radius
     along = wp.dot(away, direction)
     return beside <= 0.0 or (along > 0.0 and along * along > beside)
@@ -107,7 +107,7 @@ def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool
 
 @functools.cache
 def make_mean_facing(config: RelightConfig) -> wp.Function:
-    """``mean_facing(receiver, point, normal) -> vec3``: cosine-weighted mean of the environment before a surface.
+    """``mean_facing(receiver, point, normal) -> vec3``: cosine-weighted mean radiance above a surface.
 
     Emitters keep the directions in which the balls show them.
     """
@@ -119,7 +119,7 @@ def make_mean_facing(config: RelightConfig) -> wp.Function:
             receiver.irradiance_sh, receiver.irradiance_map, receiver.emitters, receiver.others, point, normal
         )
         mean = received / wp.pi
-        # A series may ring below zero, which no light does.
+        # Spherical harmonics may ring below 0; radiance does not.
         return wp.max(mean, wp.vec3(0.0, 0.0, 0.0))
 
     return mean_facing
@@ -127,7 +127,7 @@ def make_mean_facing(config: RelightConfig) -> wp.Function:
 
 @wp.func
 def bound_solids(scene: RayScene) -> wp.vec4:
-    """Return the centre and radius of a sphere around all proxies that can hide light: all but planes."""
+    """Return (x, y, z, radius) of a sphere around all proxies except planes: those that can hide light."""
     middle = wp.vec3()
     solid = float(0.0)
     for index in range(scene.proxies.shape[0]):
@@ -153,7 +153,10 @@ class Hider:
 
 @functools.cache
 def make_find_hider(config: RelightConfig) -> wp.Function:
-    """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``; ``solids`` of ``bound_solids``."""
+    """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``: obstacle before a sample.
+
+    ``toward`` leads to the sample; ``solids`` is the result of ``bound_solids``.
+    """
     mean_facing = make_mean_facing(config)
     find_in_frame = make_find_in_frame(config.trace)
     closest_proxy = make_trace(config.trace).closest_proxy
@@ -176,7 +179,7 @@ def make_find_hider(config: RelightConfig) -> wp.Function:
                     normal = (t * toward.direction - away) / probe.radius
                     found.radiance = wp.cw_mul(probe.reflectance, mean_facing(receiver, probe.center, normal))
         if wp.static(not only_planes):
-            # Most samples pass by the ball around all proxies.
+            # Most rays miss the sphere around all proxies.
             if meets_ball(wp.vec3(solids[0], solids[1], solids[2]) - hit.point, solids[3], toward.direction):
                 origin = offset_origin(hit.point, hit.geometric_normal, toward.direction, hit.error)
                 hidden = closest_proxy(scene, origin, toward.direction, nearest)
@@ -198,7 +201,7 @@ def make_find_hider(config: RelightConfig) -> wp.Function:
 
 @wp.func
 def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
-    """Return whether a virtual light shines on a point, occlusion ignored."""
+    """Return whether any virtual light reaches a point if nothing hides it."""
     for index in range(lights.shape[0]):
         light = sample_light(lights[index], hit.point)
         if wp.dot(hit.geometric_normal, light.wi) > 0.0 and wp.max(light.irradiance_normal) > 0.0:
@@ -412,7 +415,7 @@ def list_patches_kernel(
     listed_out: wp.array2d[Patch],
     count_out: wp.array[wp.int32],
 ):
-    """List the patches of a row that reflect light, in their order: sums over them are the same in every run."""
+    """List the patches of a row that reflect light, from left to right, so that sums are the same in every run."""
     i = wp.tid() + row_start
     count = int(0)
     for j in range(patches.shape[1]):
@@ -451,7 +454,7 @@ def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
         if hit.shape < 0:
             return
         total = wp.vec3()
-        # Only rows in light_rect: the others may hold patches of an earlier frame.
+        # Other rows than those of light_rect may hold patches of an earlier frame.
         for row in range(rect[0] / patch_stride, wp.min((rect[1] - 1) / patch_stride + 1, patches.shape[0])):
             for k in range(count[row]):
                 patch = patches[row, k]
@@ -483,25 +486,25 @@ Args:
         ``gather_light`` if ``bounced``.
     samples: (n,) samples of the environment, the same for all cells, so that neighbours do not differ by noise. If n is
         a power of 2, the first n of a longer sequence are an aligned block of Sobol's sequence.
-    bounced: Whether to estimate the cells that only bounced light reaches, and keep those of the first call.
+    bounced: True to estimate only the cells that bounced light alone reaches; the others keep their values.
     cells_out: Cells of ambient visibility.
 """
 
 
 estimate_area_light = row_launcher(make_area_light_kernel, like=lambda *given: given[-1].values)
-"""Find the irradiance that emitting objects send to the receiver, per cell.
+"""Estimate the irradiance of each cell of the receiver by emitting objects.
 
 Args:
     config: Kinds of shape, and samples of emitting objects per cell.
     params: (1,) FrameParams: camera and light_rect.
     scene: Objects and proxies.
     receiver: From ``make_receiver``: picture and balls.
-    cells_out: Cells of that irradiance.
+    cells_out: Cells of irradiance.
 """
 
 
 send_light = row_launcher(make_send_light_kernel)
-"""Find the virtual light that every patch of the receiver reflects.
+"""Find the virtual light that every patch (block of pixels of the receiver) reflects.
 
 Args:
     config: As for ``estimate_ambient_visibility``.

@@ -55,9 +55,9 @@ wp.set_module_options({"enable_backward": False})
 
 _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
 _MASKED = 8
-"""Largest number of lights with separate shadow bits in the mask that ``relight`` writes for ``smooth_edges``."""
+"""Number of lights that have their own shadow bit in the visibility that ``relight`` writes for ``smooth_edges``."""
 _LIT = wp.constant(1 << _MASKED)
-"""Bit that is set if any light arrives; the bits above it hold the key of the surface."""
+"""Bit of the visibility that is set if any virtual light arrives; the higher bits hold the key of the surface."""
 _SURFACE = wp.constant(_MASKED + 1)
 _NOTHING = wp.constant(-1 << (_MASKED + 1))
 _BALL = wp.constant(-2 << (_MASKED + 1))
@@ -73,7 +73,7 @@ class DirectLighting:
 
 @functools.cache
 def make_area_response(config: RelightConfig) -> wp.Function:
-    """``area_response(scene, receiver, hit, matter, turn) -> vec3``: sum of E_v visible response over emitters."""
+    """``area_response(scene, receiver, hit, matter, turn)``: E_v visible response, summed over emitting objects."""
     is_lit, respond = make_shadow(config.trace), make_respond(config.method)
     area_count, area_sample = make_area_count(config.area_samples), make_area_sample(config.area_samples)
 
@@ -101,7 +101,7 @@ def make_area_response(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_direct_lighting(config: RelightConfig) -> wp.Function:
-    """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting``: of virtual light.
+    """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting`` of a hit.
 
     The pixel (row, col) shows the hit directly if ``mirror`` is zero. Otherwise it shows the hit reflected in a mirror
     ball of reflectance ``mirror``; then values of cells are not used. ``turn`` is passed to ``visible_share``.
@@ -231,10 +231,10 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
 
 @wp.func
 def is_edge(visibility: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
-    """Return whether virtual light may have an edge within a pixel or between it and one of its four neighbours.
+    """Return whether virtual light may have an edge between a pixel and one of its four neighbours.
 
-    That is so if a light without penumbra is hidden from one of the two alone, or if they show different surfaces and
-    light arrives at one. Pixels that show a ball have no edges: ``mirror_ball`` adds their light.
+    It has one if a light without penumbra is hidden from only one of the two pixels, or if they show different surfaces
+    and light arrives at either. Pixels that show a ball have no edges: ``mirror_ball`` adds their light.
     """
     here = visibility[row, column]
     if here == _BALL:
@@ -287,7 +287,7 @@ def make_sample_lighting(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp.Kernel:
-    """Kernel that samples edge pixels in place; if ``left``, it does nothing unless the list of edges overflowed."""
+    """Kernel that finds edge pixels and samples them at once; if ``left``, only when the list of edges overflowed."""
     sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -332,7 +332,7 @@ def list_edges_kernel(
     # Out:
     list_out: EdgeList,
 ):
-    """List the pixels that ``is_edge`` finds."""
+    """Append a pixel to the list if it is an edge by ``is_edge``."""
     i, j = wp.tid()
     rect = params[0].light_rect
     i += row_start
@@ -343,7 +343,7 @@ def list_edges_kernel(
 
 @functools.cache
 def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel that takes every sample of the edges that were listed."""
+    """Kernel that computes every sample of the listed edge pixels."""
     sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -372,7 +372,7 @@ def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
 relight = row_launcher(make_relight_kernel, outputs=2)
 """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
 
-One sample per pixel: where ``config.edge_samples`` is more than 1, ``smooth_edges`` comes next.
+Each pixel has one sample; if ``config.edge_samples`` exceeds 1, call ``smooth_edges`` next.
 
 Args:
     config: Method and kinds of shape.
@@ -381,8 +381,8 @@ Args:
     lights: (n,) Light.
     receiver: From ``make_receiver``.
     added_out: (H, W) linear radiance in camera values.
-    visibility_out: (H, W) surface of a pixel and the lights hidden from it; None if ``config.edge_samples`` is 1.
-        Only what lies in ``light_rect`` is written.
+    visibility_out: (H, W) bits: key of a pixel's surface, and lights hidden from it. Written only inside
+        ``light_rect``; None if ``config.edge_samples`` is 1.
 """
 
 
@@ -401,14 +401,14 @@ def smooth_edges(
     """Average ``config.edge_samples`` samples in pixels along the edges of shadows and of lit proxies.
 
     Args:
-        config: As that of ``relight``, and so are all arguments that are not named here.
-        params: Likewise.
-        scene: Likewise.
-        lights: Likewise.
-        receiver: Likewise.
-        visibility: (H, W) as ``relight`` writes.
-        added_out: (H, W) as ``relight`` writes; changed along edges.
-        edge_lists: Scratch, for a launch over all rows: edges are then sampled on their own.
+        config: Configuration of ``relight``.
+        params: (1,) FrameParams: camera and light_rect.
+        scene: Objects and proxies.
+        lights: (n,) Light.
+        receiver: From ``make_receiver``.
+        visibility: (H, W), written by ``relight``.
+        added_out: (H, W), written by ``relight``; changed in edge pixels.
+        edge_lists: Scratch memory; if given, edges of all rows are listed first, then sampled in another kernel.
         rows: Band of rows; None means all.
     """
     shape, device = receiver.picture.rays.shape, receiver.picture.rays.device

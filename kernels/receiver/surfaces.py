@@ -7,7 +7,7 @@ proxy is seen from its front.
 
 Coverage is the share of a pixel that each surface covers, as in Cryptomatte. If all eight neighbours show the pixel's
 own surface, it covers the pixel. Otherwise the samples by which ``shade`` smooths edges are traced and counted by
-surface. The ``RANKS`` surfaces with the largest shares are kept, in falling order. The part of a pixel that shows no
+surface. The first ``RANKS`` surfaces found are kept, by falling share. The part of a pixel that shows no
 modelled surface is not stored.
 """
 
@@ -151,7 +151,7 @@ Args:
 
 @wp.func
 def add_to_rank(ranks: vec8, found: wp.int32, share: wp.float32) -> vec8:
-    """Add ``share`` to the rank of the surface ``found``, or to the first free rank; drop it if there is none."""
+    """Return ``ranks`` with ``share`` added to the surface ``found``, which is dropped if no rank is free."""
     out = ranks
     taken = bool(found < 0)
     for k in range(wp.static(RANKS)):
@@ -164,7 +164,7 @@ def add_to_rank(ranks: vec8, found: wp.int32, share: wp.float32) -> vec8:
 
 @wp.func
 def sort_ranks(ranks: vec8) -> vec8:
-    """Sort ranks by falling share with a bubble sort, which suffices for a few; equal ranks keep their order."""
+    """Return ``ranks`` sorted by falling share; equal shares keep their order. A bubble sort suffices for a few."""
     out = ranks
     for _ in range(wp.static(RANKS - 1)):
         for k in range(wp.static(RANKS - 1)):
