@@ -5,7 +5,8 @@
 Each case is run once for each number below ``--count``, by each kind of draw:
 
 - ``noise``: its frames under Gaussian noise of so many codes;
-- ``dropped``: three frames of ten, drawn anew, do not come; the first and the last do;
+- ``dropped``: three frames of ten, drawn anew, do not come; the first and the last do. Where a case's light changes
+  within its third of a second (mirror, night, overexposed), the spread is how late the estimate follows;
 - ``rows``: the map has 64, 96, 128, 192 or 256 rows;
 - ``pose``: the camera's principal point is off by a pixel, each time to another side;
 - ``tables``: ten random tables, a picture each, under noise.
