@@ -14,7 +14,7 @@ STRIDE_ROWS = 480
 
 @wp.func
 def cell_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
-    """Return the row or column of the pixel at which a cell is estimated; ``size`` is the frame's."""
+    """Return the row (or column) of the pixel at which a cell is estimated, in a frame of ``size`` rows (columns)."""
     return wp.min(cell * stride + stride / 2, size - 1)
 
 
@@ -46,8 +46,8 @@ class SurfaceCells:
 def look_up_cells(cells: SurfaceCells, key: wp.int32, size: wp.vec2i, row: wp.int32, col: wp.int32) -> wp.vec4:
     """Interpolate cells to a pixel bilinearly, among the cells of the pixel's surface alone.
 
-    Return (RGB, 1), or zero if none of the four cells around the pixel lies on its surface ``key``. If only cells of
-    zero bilinear weight do, the result is their mean. ``size`` holds the rows and columns of the frame.
+    Return (RGB, 1), or zero if none of the four cells around the pixel shows its surface ``key``. If all cells that
+    show it have a bilinear weight of 0, return (their mean, 1). ``size`` holds the rows and columns of the frame.
     """
     y = cell_place(row, cells.stride, size[0])
     x = cell_place(col, cells.stride, size[1])

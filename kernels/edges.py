@@ -66,7 +66,7 @@ def listed_edges(listed: EdgeList) -> wp.int32:
 
 @functools.cache
 def make_average_edges_kernel(weighted: bool) -> wp.Kernel:
-    """Kernel that averages the samples of every listed edge, in their order.
+    """Kernel that averages the samples of every listed edge pixel, in the order of the samples.
 
     Args:
         weighted: If True, the fourth component is the sample's weight, 0 or 1, and not written. If False, it is

@@ -61,7 +61,7 @@ def add_emitters(irradiance: wp.vec3, emitters: wp.array[Emitter], point: wp.vec
 
 @wp.func
 def emitter_weight(away: wp.float32, off: wp.float32) -> wp.float32:
-    """Return the factor f of an emitter for a direction, as derived above.
+    """Return the factor f, 0..1, by which an emitter rotates a direction: (1 - s^4)^2, or 0 from s = 1 on.
 
     Args:
         away: |w - u|, distance between the direction and the emitter's direction from the point.
@@ -76,7 +76,7 @@ def emitter_weight(away: wp.float32, off: wp.float32) -> wp.float32:
 
 @wp.func
 def correct_parallax(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """Return the unit direction of the environment that a point sees along the unit direction ``direction``."""
+    """Return the unit direction in which to read the environment for a ray from ``point`` along ``direction``."""
     spin = wp.vec3(0.0)
     weights = float(1.0)
     for k in range(emitters.shape[0]):

@@ -64,7 +64,7 @@ def noting() -> Iterator[list[Note]]:
 
 
 def do_or_note(note: Note) -> None:
-    """Execute a note, or append it to the list of ``noting``."""
+    """Execute a launch or copy or, inside ``noting``, append it to the list instead."""
     notes = getattr(_NOTES, "list", None)
     if notes is None:
         note.do()
@@ -90,7 +90,7 @@ def launch(
     stream: wp.Stream | None = None,
     block_dim: int = 256,
 ) -> None:
-    """Launch a kernel that is not split, as ``wp.launch`` does."""
+    """Launch a kernel that is not split into bands; arguments as for ``wp.launch``."""
     device = device_of(device, [*outputs, *inputs])
     given = {"dim": dim, "inputs": inputs, "outputs": outputs, "device": device, "stream": stream}
     given["block_dim"] = None if device.is_cpu else block_dim

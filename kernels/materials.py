@@ -106,7 +106,7 @@ def surface_point(scene: RayScene, hit: Hit, cos_o: wp.float32, spread: wp.float
 
 @wp.func
 def roughness_at(scene: RayScene, material: Material, point: SurfacePoint) -> wp.float32:
-    """Return the roughness at a point, times its texture's if there is one."""
+    """Return the roughness at a point: the material's, times the texture's value if there is one."""
     if material.metallic_roughness_texture >= 0:
         return material.roughness * sample_texture(scene, material.metallic_roughness_texture, point)[1]
     return material.roughness
@@ -246,7 +246,7 @@ def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.f
 
 @wp.func
 def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """Return the mirror direction of ``wo``."""
+    """Return the direction of perfect mirror reflection of ``wo`` at a surface of unit ``normal``."""
     return 2.0 * wp.dot(normal, wo) * normal - wo
 
 
@@ -261,7 +261,7 @@ def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
 # 0.25, 0.35, 0.5, 0.7, 0.9. Around R alone the error of the reflection is twice as large at 0.7, five times at 1.
 @wp.func
 def lobe_axis(surface: Surface, mirror: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """Return the direction at which the prefiltered environment is read for a surface's lobe, derived above; unit."""
+    """Return the unit direction in which the prefiltered environment is read for a surface's lobe."""
     if surface.model != METALLIC_ROUGHNESS:
         return mirror
     roughness = surface.roughness
@@ -270,7 +270,7 @@ def lobe_axis(surface: Surface, mirror: wp.vec3, normal: wp.vec3) -> wp.vec3:
 
 @wp.func
 def phong_lobe(mirror: wp.vec3, wi: wp.vec3, exponent: wp.float32) -> wp.float32:
-    """(n + 1) / (2 pi) cos^n of the angle between two unit vectors, 0 behind ([LW94] without the surface's cosine).
+    """Return (n + 1) / (2 pi) cos^n of the angle between two unit vectors, or 0 beyond 90 degrees [LW94].
 
     With x = 1 - cos = |mirror - wi|^2 / 2, cos^n = exp(n log1p(-x)): x keeps its digits near the peak, where those of
     the cosine are gone at exponents of 1e5, and log1p is Kahan's log(u) z / (u - 1) with u = 1 + z rounded.
@@ -288,7 +288,7 @@ def phong_lobe(mirror: wp.vec3, wi: wp.vec3, exponent: wp.float32) -> wp.float32
 
 @wp.func
 def ggx_lobe(normal: wp.vec3, half: wp.vec3, cos_i: wp.float32, cos_o: wp.float32, roughness: wp.float32) -> wp.float32:
-    """GGX distribution times Smith visibility, D V = D G / (4 cos_i cos_o), without Fresnel.
+    """Return the GGX distribution times Smith visibility, D V = D G / (4 cos_i cos_o), without Fresnel.
 
     With s^2 = |n x h|^2 for 1 - (n.h)^2, D = k^2 / pi, k = alpha / (s^2 + alpha^2 (n.h)^2): equal to [WMLT07] eq. 33,
     no cancellation at the peak, where 1 - (n.h)^2 has none of its digits left. In V, 1 - alpha^2 is (1 - a)(1 + a).
@@ -307,7 +307,7 @@ def ggx_lobe(normal: wp.vec3, half: wp.vec3, cos_i: wp.float32, cos_o: wp.float3
 
 @wp.func
 def schlick(cosine: wp.float32) -> wp.float32:
-    """(1 - cos)^5, the share of F90 = 1 in Schlick's Fresnel term."""
+    """Return (1 - cos)^5, the weight of F90 = 1 in Schlick's Fresnel term."""
     x = wp.clamp(1.0 - cosine, 0.0, 1.0)
     return x * x * x * x * x
 

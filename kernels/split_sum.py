@@ -28,7 +28,7 @@ def integrate_dfg_kernel(
     # Out:
     dfg_out: wp.array2d[wp.vec2],
 ):
-    """Scale and bias of F0 for one roughness (row) and one n_dot_v (column), both from 0 to 1 at the table's ends.
+    """Write scale and bias of F0 for one roughness (row) and one n_dot_v (column), each from 0 to 1 over the table.
 
     With half vectors visible from wo, D and one masking cancel: the estimate is F(wo.wh) G2 / G1(wo) [Heitz14].
     """
@@ -54,7 +54,7 @@ def integrate_dfg_kernel(
 
 @wp.func
 def sample_dfg(table: wp.array2d[wp.vec2], n_dot_v: wp.float32, roughness: wp.float32) -> wp.vec2:
-    """(scale, bias) such that the specular reflectance under a white sky is F0 scale + bias.
+    """Return (scale, bias) such that the specular reflectance under a white sky is F0 scale + bias.
 
     Args:
         table: (roughness, n_dot_v), as ``integrate_dfg`` writes.
@@ -86,7 +86,7 @@ def sample_dfg(table: wp.array2d[wp.vec2], n_dot_v: wp.float32, roughness: wp.fl
 # +18 and -12 %. At F0 = 1 the bracket is 1 / E, whatever s is: a white furnace stays white.
 @wp.func
 def energy_compensation(dfg: wp.vec2, f0: wp.vec3) -> wp.vec3:
-    """Return the factor on the specular part that adds light of multiple scattering, as derived above.
+    """Return the factor, per channel, by which multiple scattering increases specular reflection.
 
     E = scale + bias is the single-scattering albedo of a surface with F0 = 1. The factor holds for environment light
     and virtual lights alike.

@@ -39,7 +39,7 @@ class SurfacePoint:
 
 @wp.func
 def wrap_texel(index: wp.int32, size: wp.int32, mode: wp.int32) -> wp.int32:
-    """Return the index of a texel inside a texture, for one that may lie beyond its border."""
+    """Return the index of the texel that continues a texture at ``index``, by the mode of its border."""
     if mode == CLAMP:
         return wp.clamp(index, 0, size - 1)
     period = wp.where(mode == MIRRORED, 2 * size, size)
@@ -158,5 +158,5 @@ def point_of_triangle(
 
 @wp.func
 def slant(cosine: wp.float32) -> wp.float32:
-    """Return the factor by which a footprint is longer if the surface is seen at this cosine."""
+    """Return the factor by which a footprint is lengthened by the cosine between ray and normal."""
     return 1.0 / wp.max(wp.abs(cosine), MIN_SLANT)

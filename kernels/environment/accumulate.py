@@ -56,7 +56,7 @@ ALL_CLIPPED = wp.constant(wp.float32(0.9))
 
 @wp.func
 def known_beyond_clipping(x: wp.vec3, m: wp.vec3, clipped: wp.vec3) -> wp.vec3:
-    """Return the degree, 0 to 1, to which each channel is clipped below its known radiance m."""
+    """Return the degree, 0..1, to which the known radiance m of each channel exceeds its clipped value x."""
     beyond = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
         excess = m[channel] - x[channel]
@@ -74,7 +74,7 @@ def measure_change_kernel(
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
-    """Measure the mean signed change of one sector, by one block."""
+    """Write the mean signed change of one sector, found by one block of threads."""
     sector_row, sector_column, lane = wp.tid()
     height = view.radiance.shape[0]
     width = view.radiance.shape[1]
@@ -108,7 +108,10 @@ def measure_change_kernel(
 
 @wp.func
 def lasting_change(change: wp.array2d[wp.vec2], row: wp.int32, column: wp.int32) -> wp.float32:
-    """Return the smaller change of a sector in two frames, 0 if signs differ; rows are clamped, columns wrap."""
+    """Return the smaller absolute change of a sector in two successive frames, or 0 if their signs differ.
+
+    Rows are clamped to the map, columns wrap around.
+    """
     width = change.shape[1]
     c = change[wp.clamp(row, 0, change.shape[0] - 1), (column + width) % width]
     if c[0] * c[1] <= 0.0:

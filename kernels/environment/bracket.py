@@ -93,7 +93,7 @@ def spread_clipping_kernel(
 spread_clipping = row_launcher(
     spread_clipping_kernel, like=lambda reach, stack: (*stack.clipped.shape[1:], len(stack.clipped))
 )
-"""Find the largest clipped share near every texel along its row; ``merge_exposures`` does the same along columns.
+"""Find the largest clipped share near every texel along its row; ``merge_exposures`` searches along columns.
 
 Args:
     reach: Radians.

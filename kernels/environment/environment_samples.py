@@ -102,7 +102,7 @@ def sample_toward(sample: EnvironmentSample, point: wp.vec3) -> Incidence:
 
 @wp.func
 def slots_of(balls: wp.int32) -> wp.int32:
-    """Return the period after which the order of balls repeats, in samples."""
+    """Return the number of samples after which the order of balls repeats: the least power of two >= ``balls``."""
     slots = wp.int32(1)
     while slots < balls:
         slots *= 2
@@ -111,7 +111,7 @@ def slots_of(balls: wp.int32) -> wp.int32:
 
 @wp.func
 def ball_of_sample(index: wp.int32, balls: wp.int32) -> wp.int32:
-    """Return the ball to whose environment a sample belongs."""
+    """Return the index of the ball whose environment sample ``index`` belongs to."""
     return (index % slots_of(balls)) % balls
 
 
@@ -123,7 +123,7 @@ def turns_of(ball: wp.int32, balls: wp.int32) -> wp.int32:
 
 @wp.func
 def sobol_second(index: wp.uint32) -> wp.float32:
-    """Return the second dimension of Sobol's sequence; the first is ``radical_inverse``."""
+    """Return coordinate 2 of point ``index`` of Sobol's sequence; coordinate 1 is ``radical_inverse``."""
     bits = wp.uint32(0)
     direction = TOP_BIT
     i = index
@@ -162,7 +162,7 @@ def sum_along_rows_kernel(
     # Out:
     cumulative_out: wp.array2d[wp.float32],
 ):
-    """Write the running sums of brightness along one row, compensated so that a sun does not absorb the sky."""
+    """Write the running sums of brightness along one row, by compensated summation (a sun next to a dim sky)."""
     i = wp.tid()
     total = float(0.0)
     lost = float(0.0)
@@ -181,7 +181,7 @@ def sum_rows_kernel(
     # Out:
     rows_out: wp.array[wp.vec2],
 ):
-    """Sum (weighted brightness, weight) over the rows up to one, by one block."""
+    """Write (weighted brightness, weight) summed over all rows up to one, by one block of threads."""
     i, lane = wp.tid()
     height = cumulative.shape[0]
     width = cumulative.shape[1]
@@ -207,7 +207,7 @@ def draw_samples_kernel(
     flux_out: wp.array[wp.vec3],
     samples_out: wp.array[EnvironmentSample],
 ):
-    """Draw one sample by inverting the cumulative sums of the mixture, if the sample is this ball's."""
+    """Draw one sample of this ball by inverting cumulative sums; samples of other balls are left unchanged."""
     index = wp.tid() + row_start
     if ball_of_sample(index, turn[1]) != turn[0]:
         return
@@ -344,7 +344,7 @@ A sample shows an emitter if it is as bright as clipping and within ``EMITTER_CO
 
 Args:
     emitters: (k,) emitters. One without direction is ignored; samples of one at infinity stay distant.
-    turn: As for ``draw_samples``.
+    turn: Index of the environment's ball, and number of balls that share the samples.
     samples_out: (n,) samples, drawn from the environment of the ball to which the emitters' distances refer.
 """
 

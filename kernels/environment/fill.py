@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel is kept as it is."""
 SUPPORT = wp.constant(wp.float32(4.0))
-"""Factor from mean trust to a coarser texel's trust, at most 1: full trust from a quarter on keeps filling local."""
+"""Factor from the mean trust of texels to the coarser texel's trust, at most 1; it keeps filling local."""
 
 
 @wp.func
@@ -162,7 +162,7 @@ def push_level_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
-    """Complete a level from its coarser one, in place."""
+    """Complete one texel of a level from the coarser level, in place."""
     band_row, j = wp.tid()
     i = row_start + band_row
     value = completed(levels_out, i, j, offset, height, width, coarse_offset, coarse_height, coarse_width)
@@ -217,7 +217,7 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
     """Build the coarser levels of a seeded fill pyramid and complete them, all but level 0.
 
     Args:
-        levels_out: As ``seed_fill`` left it; changed in place.
+        levels_out: Written by ``seed_fill``; changed in place.
         height: Rows of level 0.
         width: Columns of level 0.
         most: Upper bound of a texel's radiance in means, so that an emitter does not spread over missing neighbours.
@@ -234,7 +234,7 @@ def finish_fill(levels: wp.array, environment_out: wp.array, *, rows: Rows | Non
     """Complete level 0 and write it as the environment map.
 
     Args:
-        levels: As ``push_pull`` left it.
+        levels: Written by ``push_pull``.
         environment_out: ``wp.vec3`` (h, w): finite, not negative; zero if no texel is known.
         rows: Band of rows, None for all.
     """

@@ -33,7 +33,7 @@ SIDE = wp.constant(3)
 FRAME_TRUST = wp.constant(wp.float32(0.8))
 """Trust in a texel that the frame shows; one that a ball shows has 1."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
-"""Factor on a ball's radius for hiding surfaces, because its outline is blurred."""
+"""Factor on a ball's radius in tests of what it hides, because its outline in the frame is blurred."""
 OWN_SHADOW = wp.constant(wp.float32(6.0))
 """Distance from a ball, in radii, within which it shades surfaces: its shadow in light 10 degrees above them."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
@@ -44,7 +44,7 @@ ENOUGH = wp.constant(wp.float32(0.999))
 
 @wp.func
 def passes_balls(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
-    """Return whether a ray of unit direction meets no ball up to a distance."""
+    """Return whether a ray of unit direction meets no ball within the distance ``reach``, metres."""
     for k in range(probes.shape[0]):
         to_center = probes[k].center - origin
         along = wp.dot(to_center, direction)
@@ -117,7 +117,7 @@ def make_see_texel(proxies: tuple[int, ...]) -> wp.Function:
 
 @wp.func
 def with_seen(known: wp.vec4, seen: wp.vec4) -> wp.vec4:
-    """Complete the trust of a texel, ``known`` from balls, by the result of ``see_texel``."""
+    """Return (radiance, trust) of a texel: ``known`` from balls, completed by ``seen`` from ``see_texel``."""
     count = seen[3]
     if count <= 0.0 or known[3] >= ENOUGH:
         return known

@@ -75,7 +75,7 @@ class Disc:
 
 @wp.func
 def find_disc(camera: FrameParams, probe: Probe) -> Disc:
-    """Return the outline of a ball, approximated as on the camera's axis: a circle of the ball's angular radius."""
+    """Return the outline of a ball as if it lay on the camera's axis: a circle of the ball's angular radius."""
     disc = Disc()
     from_camera = probe.center - camera.camera_position
     pixel = project(camera, from_camera)

@@ -44,7 +44,7 @@ RIM_WIDTH = wp.constant(1.5)
 """Pixels over which confidence then rises to its full value."""
 
 ALL_ALIKE = -1
-"""Index that stands for a map made of all balls."""
+"""Value of ``own`` for one map made from all balls."""
 BORROWED = wp.constant(wp.float32(1.0e-3))
 """Factor on the weight of a ball in the map of another ball."""
 
@@ -142,7 +142,7 @@ def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
 
 @wp.func
 def is_folded(camera: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, at: wp.vec3) -> wp.bool:
-    """Return whether a point's projection is false, as that of a polynomial lens beyond its field of view.
+    """Return whether a projection is invalid, which a polynomial lens model gives beyond its field of view.
 
     It is false if the ray of the pixel does not lead to the point.
 

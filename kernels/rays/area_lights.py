@@ -60,11 +60,11 @@ from warp_ar.kernels.textures import SurfacePoint, point_of_triangle
 wp.set_module_options({"enable_backward": False})
 
 POINT_SAMPLES = 1
-"""Number of samples that stands for point lights."""
+"""Value of ``samples`` that means: each emitting object is a point light."""
 CANDIDATES = 4
-"""Candidate points of which one gets a shadow ray, if samples are few."""
+"""Number of candidate points, of which one gets a shadow ray, if samples are fewer than ``MANY_SAMPLES``."""
 MANY_SAMPLES = 128
-"""Number of samples from which on each has one candidate."""
+"""Number of samples from which each has a single candidate."""
 LEAST_FACING = wp.constant(wp.float32(0.05))
 """Constant added to the cosine in a candidate's weight: a lobe may reflect light that the cosine makes small."""
 # Solid angles between which a triangle is sampled by its angle. Directions lose 1e-7 / angle^2 to float32: 1e-3 here,
@@ -101,7 +101,10 @@ def fraction(x: wp.float32) -> wp.float32:
 
 @wp.func
 def area_numbers(k: wp.int32, count: wp.int32, turn: wp.float32) -> wp.vec3:
-    """Return numbers of sample k of ``count``: one picks the triangle, two the point; ``turn`` from ``tile_turn``."""
+    """Return three numbers in [0, 1) for sample k of ``count``: one picks the triangle, two the point on it.
+
+    ``turn`` is the pixel's result of ``tile_turn``.
+    """
     rank = 16.0 * turn
     pick = (wp.float32(k) + turn + 1.0 / 32.0) / wp.float32(count)
     place = wp.float32(k) + 0.5
@@ -112,7 +115,7 @@ def area_numbers(k: wp.int32, count: wp.int32, turn: wp.float32) -> wp.vec3:
 
 @wp.func
 def find_share(shares: wp.array[wp.float32], pick: wp.float32) -> wp.int32:
-    """Return the first entry of a table of growing shares that is above ``pick``, a number in [0, 1)."""
+    """Return the index of the first entry above ``pick``, in [0, 1), in a table of cumulative shares."""
     low = wp.int32(0)
     high = shares.shape[0] - 1
     while low < high:
@@ -179,7 +182,7 @@ def sample_spherical_triangle(
 # away. Directions uniform in the cone are uniform in 1 - cos, and 1 / p is the cone's solid angle 2 pi (1 - cos).
 @wp.func
 def draw_on_sphere(scene: RayScene, shape: Shape, point: wp.vec3, u: wp.float32, v: wp.float32) -> AreaSample:
-    """Draw a uniform direction in the cone of an emitting sphere; no light inside, for its front is outside."""
+    """Draw a uniform direction in the cone of an emitting sphere; a point inside it receives no light."""
     sample = AreaSample()
     radius = shape.scale * shape.extent[0]
     away = shape.position - point
@@ -300,7 +303,10 @@ def area_radius(shape: Shape) -> wp.float32:
 
 @wp.func
 def light_as_point(scene: RayScene, light: AreaLight, point: wp.vec3) -> AreaSample:
-    """Return the object as a point light, equation (2); for round objects, shadow rays end at the bounding sphere."""
+    """Return an emitting object as a point light, equation (2).
+
+    Shadow rays to objects that are not flat end at the bounding sphere.
+    """
     sample = AreaSample()
     shape = scene.objects[light.object]
     away = shape.position - point
@@ -396,7 +402,7 @@ def lobe_solid_angle(surface: Surface) -> wp.float32:
 
 @wp.func
 def looks_by_lobe(shape: Shape, point: wp.vec3, lobe: wp.float32) -> wp.bool:
-    """Return whether an object's light in a lobe of solid angle ``lobe`` is found by rays, not by points on it."""
+    """Return whether an emitting object is sampled by rays into the lobe (solid angle ``lobe``), not by points."""
     away = shape.position - point
     square = wp.dot(away, away)
     radius = area_radius(shape)
@@ -408,7 +414,7 @@ def looks_by_lobe(shape: Shape, point: wp.vec3, lobe: wp.float32) -> wp.bool:
 
 @wp.func
 def draw_lobe(surface: Surface, normal: wp.vec3, wo: wp.vec3, u: wp.vec2) -> wp.vec3:
-    """Draw the unit direction of a ray into the lobe of a surface."""
+    """Return a unit direction sampled from a surface's lobe by ``u``, a point of the unit square."""
     if surface.model == PHONG:
         return frame_from_normal(reflect(wo, normal)) * sample_phong_lobe(u, surface.shininess)
     if surface.model == METALLIC_ROUGHNESS:
@@ -420,7 +426,7 @@ def draw_lobe(surface: Surface, normal: wp.vec3, wo: wp.vec3, u: wp.vec2) -> wp.
 
 @wp.func
 def lobe_weight(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> wp.vec3:
-    """Return the lobe's reflection of light from ``wi``, over the density of ``draw_lobe``."""
+    """Return the weight of a ray from ``draw_lobe``: BRDF times cosine over the pdf, per channel."""
     if surface.model == METALLIC_ROUGHNESS:
         half = wp.normalize(wi + wo)
         alpha = surface.roughness * surface.roughness
@@ -434,7 +440,7 @@ def lobe_weight(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> 
 
 @wp.func
 def without_lobe(surface: Surface) -> Surface:
-    """Return the surface without its lobe."""
+    """Return the surface with its diffuse reflection alone."""
     result = surface
     result.reflectance = wp.vec3(0.0)
     result.f0 = wp.vec3(0.0)

@@ -19,14 +19,14 @@ from warp_ar.kernels.textures import point_of_triangle, sample_texture, slant
 wp.set_module_options({"enable_backward": False})
 
 MOST_LAYERS = wp.constant(64)
-"""Largest number of triangles of one mesh that a ray passes through; it meets no further ones."""
+"""Largest number of transparent triangles of one mesh that a ray crosses; beyond them it meets none."""
 
 
 @wp.func
 def is_there(
     scene: RayScene, shape: Shape, contact: Contact, origin: wp.vec3, direction: wp.vec3, sided: wp.bool
 ) -> wp.bool:
-    """Return whether a triangle stops a ray in the shape's coordinates; if ``sided``, not from behind.
+    """Return whether the triangle at ``contact`` stops a ray; if ``sided``, single-sided ones let it pass from behind.
 
     Blended triangles stop a share of rays equal to their alpha, by a threshold hashed from cells of space about a pixel
     wide. So the pattern stays with the surface when the camera moves [WM17].
@@ -68,7 +68,7 @@ def is_there(
 def intersect_solid(
     scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, sided: wp.bool
 ) -> Contact:
-    """Return the closest face of a mesh that stops a ray; up to ``MOST_LAYERS`` faces are passed through.
+    """Return the closest triangle of a mesh that stops a ray; up to ``MOST_LAYERS`` triangles are crossed.
 
     A ray continues a little behind a face that it passed, by more than rounding, so that it does not meet the same face
     again.

@@ -22,7 +22,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 STACK = 32
-"""Size of the stack: at most one node waits per level above a leaf, and Warp's builder ends trees at level 31."""
+"""Size of the stack: each level holds at most one pending node, and trees built by Warp have up to 31 levels."""
 
 _WALK = """
     #if defined(__CUDA_ARCH__)
@@ -140,7 +140,7 @@ _CLOSEST = """
     )
 )
 def find_closest_face(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.vec4:
-    """Return t of the closest triangle before ``t_max``, two barycentric weights, and the bits of its index or -1."""
+    """Return (t, u, v, index) of the closest triangle before ``t_max``; the index, or -1, is the bits of a float."""
 
 
 @wp.func_native(_WALK.format(stack=STACK, found="", meet="return true;", missed="false"))

@@ -21,9 +21,9 @@ from warp_ar.kernels.structs import BOX, MESH, Hit, RayScene, Shape
 wp.set_module_options({"enable_backward": False})
 
 FACES = wp.constant(8)
-"""Numbers of ``surface_key`` per shape."""
+"""Number of values of ``surface_key`` that each proxy has."""
 MESH_KEY = wp.constant(7)
-"""``surface_key`` modulo ``FACES`` of a mesh."""
+"""Remainder of a mesh's ``surface_key`` by ``FACES``."""
 # Half the spacing of float32 at 1: the relative error of one rounding.
 ROUNDING = wp.constant(wp.float32(2.0**-24))
 FAR = wp.constant(wp.float32(3.0e38))
@@ -41,19 +41,19 @@ class Contact:
 
 @wp.func
 def to_rigid_point(shape: Shape, point: wp.vec3) -> wp.vec3:
-    """World point in the coordinates of a shape that is not stretched."""
+    """Return a world point in the local coordinates of a shape that is not stretched."""
     return wp.transpose(shape.rotation) * (point - shape.position) / shape.scale
 
 
 @wp.func
 def to_rigid_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
-    """World direction in the coordinates of a shape that is not stretched; as ``to_local_vector``."""
+    """Return a world direction in the local coordinates of a shape that is not stretched, divided by its scale."""
     return wp.transpose(shape.rotation) * direction / shape.scale
 
 
 @wp.func
 def to_local_point(shape: Shape, point: wp.vec3) -> wp.vec3:
-    """World point in the shape's coordinates."""
+    """Return a world point in the shape's local coordinates."""
     if shape.stretch != 0.0:
         return shape.inverse * (point - shape.position) / shape.scale
     return to_rigid_point(shape, point)
@@ -61,7 +61,7 @@ def to_local_point(shape: Shape, point: wp.vec3) -> wp.vec3:
 
 @wp.func
 def to_local_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
-    """World direction in the shape's coordinates, divided by the scale so that t keeps its meaning."""
+    """Return a world direction in the shape's local coordinates, divided by its scale so that t is unchanged."""
     if shape.stretch != 0.0:
         return shape.inverse * direction / shape.scale
     return to_rigid_vector(shape, direction)
@@ -69,7 +69,7 @@ def to_local_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
 
 @wp.func
 def to_world_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
-    """Unit normal of the shape in the world: normals go by the inverse's transpose."""
+    """Return the unit world normal for a local one, by the transpose of the inverse map."""
     if shape.stretch != 0.0:
         return wp.normalize(wp.transpose(shape.inverse) * normal)
     return shape.rotation * normal
@@ -77,7 +77,7 @@ def to_world_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
 
 @wp.func
 def to_rigid_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
-    """Unit normal of a shape that is not stretched in the world."""
+    """Return the unit world normal for a local one of a shape that is not stretched."""
     return shape.rotation * normal
 
 
@@ -165,7 +165,7 @@ def enter_mesh(half: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.float32
 # most two radii.
 @wp.func
 def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Contact:
-    """Closest face of a mesh from either side; watertight, see above."""
+    """Return the closest triangle of a mesh, hit from either side; the test is watertight."""
     contact = Contact()
     contact.t = FAR
     start = enter_mesh(shape.extent, origin, direction)
@@ -191,7 +191,7 @@ def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.floa
 
 @wp.func
 def box_normal(half: wp.vec3, point: wp.vec3) -> wp.vec3:
-    """Outward normal of the face that a point on a box is nearest to."""
+    """Return the outward normal of the box face nearest to a point, in local coordinates."""
     x = wp.abs(point[0]) - half[0]
     y = wp.abs(point[1]) - half[1]
     z = wp.abs(point[2]) - half[2]
@@ -204,7 +204,7 @@ def box_normal(half: wp.vec3, point: wp.vec3) -> wp.vec3:
 
 @wp.func
 def box_uv(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec2:
-    """Texture coordinates 0..1 on each face: u and v run along the next two axes, mirrored in u on negative faces."""
+    """Return texture coordinates 0..1 on a box face: along the next two axes, with u mirrored on negative faces."""
     p = wp.cw_div(point, half)
     if normal[0] != 0.0:
         return wp.vec2(0.5 + 0.5 * normal[0] * p[1], 0.5 + 0.5 * p[2])
@@ -215,7 +215,7 @@ def box_uv(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec2:
 
 @wp.func
 def onto_box(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec3:
-    """Project a point near a box onto the face with the given normal."""
+    """Return a point near a box, projected onto the face with the given normal."""
     return wp.vec3(
         wp.where(normal[0] != 0.0, normal[0] * half[0], point[0]),
         wp.where(normal[1] != 0.0, normal[1] * half[1], point[1]),
@@ -225,13 +225,13 @@ def onto_box(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec3:
 
 @wp.func
 def plane_uv(half: wp.vec3, point: wp.vec3) -> wp.vec2:
-    """Texture coordinates 0..1 on a plane."""
+    """Return texture coordinates 0..1 on a plane."""
     return wp.vec2(0.5 + 0.5 * point[0] / half[0], 0.5 + 0.5 * point[1] / half[1])
 
 
 @wp.func
 def sphere_uv(normal: wp.vec3) -> wp.vec2:
-    """Texture coordinates of a sphere: u runs as a latlong map's columns, v from -z to +z."""
+    """Return texture coordinates of a sphere: u along longitude, as columns of a latlong map, v from -z to +z."""
     phi = wp.atan2(normal[1], normal[0])
     theta = wp.atan2(wp.sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2])
     return wp.vec2(0.5 + phi / (2.0 * wp.pi), 1.0 - theta / wp.pi)
@@ -239,7 +239,7 @@ def sphere_uv(normal: wp.vec3) -> wp.vec2:
 
 @wp.func
 def surface_key(scene: RayScene, hit: Hit) -> wp.int32:
-    """Return a number that points on one flat surface of a proxy share, the face of a box included; -1 for no hit."""
+    """Return a number that identifies the surface of a proxy: a plane, a face of a box, or a mesh; -1 for no hit."""
     if hit.shape < 0:
         return -1
     shape = scene.proxies[hit.shape]

@@ -72,15 +72,15 @@ class Trace(NamedTuple):
     """Functions for kernels, each taking ``(scene: RayScene, origin: vec3, direction: vec3, t_max: float32)``."""
 
     closest_object: wp.Function
-    """Closest virtual object: ``Hit``."""
+    """Returns the ``Hit`` of the closest virtual object."""
     closest_proxy: wp.Function
-    """Closest proxy: ``Hit``."""
+    """Returns the ``Hit`` of the closest proxy."""
     occluded_by_objects: wp.Function
-    """True if any virtual object lies in the way: ``bool``."""
+    """Returns True if the ray meets a virtual object before ``t_max``."""
     occluded_by_proxies: wp.Function
-    """True if any proxy lies in the way: ``bool``."""
+    """Returns True if the ray meets a proxy before ``t_max``."""
     occluded: wp.Function
-    """Either of the two."""
+    """Returns True if the ray meets a virtual object or a proxy before ``t_max``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _label(kinds: tuple[int, ...], detail: bool, stretched: bool) -> str:
 
 @functools.cache
 def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """Closest hit among shapes of the given kinds."""
+    """Return a function that finds the closest hit among shapes of the given kinds."""
     local_point, local_vector, world_normal = _ways(stretched)
 
     # One long function: on a CPU arguments are copied for every function that is called.
@@ -230,7 +230,7 @@ def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.F
 
 @functools.cache
 def _make_meets(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """Return whether a ray meets a shape of one of the given kinds."""
+    """Return a function that tests a ray against one shape, of one of the given kinds."""
     local_point, local_vector, _ = _ways(stretched)
 
     @wp.func(name=f"meets_{_label(kinds, detail, stretched)}", module="unique")
@@ -259,7 +259,7 @@ def _make_meets(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Fun
 
 @functools.cache
 def _make_any(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """Return whether a ray meets any of the shapes of the given kinds."""
+    """Return a function that tests a ray against all shapes of an array, of the given kinds."""
     meets = _make_meets(kinds, detail, stretched)
 
     @wp.func(name=f"any_hit_{_label(kinds, detail, stretched)}", module="unique")
@@ -277,7 +277,7 @@ def _make_any(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Funct
 
 @functools.cache
 def _make_any_of_both(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
-    """Return whether a ray meets any object or proxy of the given kinds: one loop, for its walks are long code."""
+    """Return a function that tests a ray against objects and proxies, in one loop to compile the mesh code once."""
     meets = _make_meets(kinds, detail, stretched)
 
     @wp.func(module="unique")
@@ -298,7 +298,7 @@ def _make_any_of_both(kinds: tuple[int, ...], detail: bool, stretched: bool) -> 
 
 @functools.cache
 def make_trace(config: TraceConfig) -> Trace:
-    """Functions that trace rays through a scene with the kinds of shape in ``config``; equal configs share them."""
+    """Return functions that trace rays through scenes with the kinds of shape in ``config``, shared by equal ones."""
     closest_object, any_object = _through_objects(config)
     closest_proxy, any_proxy = _through_proxies(config.proxies)
     if config.objects == config.proxies:
@@ -315,7 +315,7 @@ def make_trace(config: TraceConfig) -> Trace:
 
 
 def _through_objects(config: TraceConfig) -> tuple[wp.Function, wp.Function]:
-    """Closest and any hit among objects."""
+    """Return functions for the closest and for any hit among objects."""
     closest, any_hit = make_walks(config.objects, config.detail, config.stretched)
 
     @wp.func(module="unique")
@@ -330,7 +330,7 @@ def _through_objects(config: TraceConfig) -> tuple[wp.Function, wp.Function]:
 
 
 def _through_proxies(kinds: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
-    """Closest and any hit among proxies."""
+    """Return functions for the closest and for any hit among proxies."""
     closest, any_hit = make_walks(kinds, False, False)
 
     @wp.func(module="unique")
@@ -345,11 +345,13 @@ def _through_proxies(kinds: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
 
 
 def make_walks(kinds: tuple[int, ...], detail: bool, stretched: bool) -> tuple[wp.Function, wp.Function]:
-    """Closest and any hit among shapes of some kinds, each taking ``(scene, shapes, origin, direction, t_max)``.
+    """Return functions for the closest and any hit in an array ``shapes``.
+
+    Each takes ``(scene, shapes, origin, direction, t_max)``.
 
     Args:
-        kinds: Of the shapes.
-        detail: As in ``TraceConfig``.
-        stretched: As in ``TraceConfig``.
+        kinds: Kinds of the shapes.
+        detail: True if triangles may let rays pass or have normal maps.
+        stretched: True if shapes may be stretched.
     """
     return _make_closest(kinds, detail, stretched), _make_any(kinds, detail, stretched)

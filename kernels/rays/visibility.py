@@ -79,8 +79,8 @@ def make_visible_proxy(config: TraceConfig) -> wp.Function:
 def make_visible_cell(config: TraceConfig) -> wp.Function:
     """``visible_cell(params, rays, scene, balls, cell, stride, margin, rect) -> Hit``: the proxy that a cell shows.
 
-    The shape is -1 as for ``visible_proxy``, and for a cell that no pixel of ``rect`` reads: pixels read cells that are
-    estimated at most ``margin`` pixels away.
+    A cell is a block of pixels. The shape is -1 if the cell shows no proxy from its front, or if it lies more than
+    ``margin`` pixels outside ``rect``, so that no pixel reads it.
     """
     visible_proxy = make_visible_proxy(config)
 
@@ -108,10 +108,10 @@ def make_visible_cell(config: TraceConfig) -> wp.Function:
 
 
 def check_edge_samples(count: int) -> None:
-    """Raise an error unless ``make_sample_direction`` can place so many samples.
+    """Raise an error unless ``count`` is a number of samples that ``make_sample_direction`` can place.
 
     Raises:
-        ValueError: It is no square number.
+        ValueError: ``count`` is no square number.
     """
     if count < 1 or math.isqrt(count) ** 2 != count:
         raise ValueError(f"edge_samples is {count}; expected a square number such as 1, 4 or 16")

@@ -51,7 +51,7 @@ class Accumulate(Stage):
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the accumulated maps, and the change of each cell."""
+        """Return the accumulated maps, and the change of each sector (block of texels)."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         others = self.features.others
@@ -68,7 +68,7 @@ class Accumulate(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return passes for the change, then for the mean; both are off in frames in which something covers a ball."""
+        """Return passes for the change, then for the mean; neither runs in frames in which something covers a ball."""
         height = self.request.quality.environment_height
         view = find_view(arrays, self.wiring.reads[0].removesuffix("_radiance"))
         environment, change, params = find_view(arrays, "environment"), arrays["accumulate_change"], arrays["params"]

@@ -67,12 +67,15 @@ class Reach:
 
 
 OUT_OF_PICTURE = "no virtual object is in the picture"
-"""Reason for several stages to be idle."""
+"""Reason for which several stages are idle in a frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pass:
-    """One launch or a short fixed series, whose parts may run in parallel; the next pass waits for all of them."""
+    """One launch or a short fixed series of launches, split into bands that may run in parallel.
+
+    The next pass waits until all bands are done.
+    """
 
     launch: Callable[[Rows | None], None]
     """Function that calls the stage's launcher; its argument is the band of rows, None for all."""
@@ -94,7 +97,7 @@ class Pass:
 def over_rows(
     rows: int | None, launcher: Callable[..., None], *given: Any, extent: Callable[[], Rows] | None = None, **named: Any
 ) -> Pass:
-    """Return a pass that splits ``rows`` into bands for a launcher; ``given`` and ``named`` are its other arguments."""
+    """Return a pass that calls ``launcher(*given, rows=band, **named)`` for bands of ``rows`` rows; None: one call."""
     return Pass(lambda band: launcher(*given, rows=band, **named), rows, extent)
 
 
@@ -131,14 +134,14 @@ class Arrays(dict[str, Any]):
     """Named arrays of a pipeline. Each has a version, a number that grows whenever its contents change."""
 
     def __init__(self, constants: dict[Any, Any] | None = None) -> None:
-        """Start empty, except for the ``constants`` of another pipeline on the same device."""
+        """Start without arrays; ``constants``, if given, are shared with another pipeline on the same device."""
         super().__init__()
         self._versions: dict[str, int] = {}
         self.constants: dict[Any, Any] = {} if constants is None else constants
         """Tables that are determined by their key and never overwritten."""
 
     def constant(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return the table of a key; make it on first use."""
+        """Return the table stored under ``key``; it is made by ``make`` when it is first requested."""
         if key not in self.constants:
             self.constants[key] = make()
         return self.constants[key]
@@ -170,7 +173,7 @@ class Arrays(dict[str, Any]):
 NO_BALL = "the scene has no mirror ball, so the environment is unknown"
 NO_OBJECT = "the scene has no virtual object"
 NOT_ASKED = "none of its layers is asked for"
-"""Reason for several stages to be left out."""
+"""Reason for which several stages are left out of a plan."""
 
 
 def unobserved(features: Features) -> str:
@@ -242,7 +245,7 @@ class Stage(abc.ABC):
         """Prepare a frame in which the stage runs; called once, before its passes."""
 
     def host_kernels(self) -> tuple[Any, ...]:
-        """Return the kernels that its host steps launch, to compile them with the others."""
+        """Return the kernels that the stage's host passes launch, so that they are compiled in advance."""
         return ()
 
     def idle(self, reach: Reach) -> str | None:
@@ -254,11 +257,11 @@ class Stage(abc.ABC):
         return None
 
     def reads_for(self, reach: Reach) -> tuple[str, ...]:
-        """Return the inputs that can affect this frame's output; depends on the same values as ``idle``."""
+        """Return the resources that can affect this frame's output, given ``reach`` and the stage's inputs."""
         return self.wiring.reads
 
     def rest(self) -> None:  # noqa: B027
-        """Prepare a frame in which nothing reads the stage's output; called instead of ``begin``."""
+        """Prepare a frame in which nothing reads the stage's output; called instead of ``begin``, and no pass runs."""
 
     def runs_after(self) -> tuple[str, ...]:
         """Return the names of stages that are launched before this one on CUDA although it does not read their output.

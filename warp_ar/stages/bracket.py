@@ -16,7 +16,7 @@ from warp_ar.stages.shared.probe_maps import UNWRAPPED, find_view
 
 
 class Bracket(Stage):
-    """Merges the latest frame of every exposure; frames of other exposures are unwrapped by ``ShortFrames``."""
+    """Merges the latest frames of all exposures; ``ShortFrames`` unwraps those of exposures that are not shown."""
 
     name: ClassVar[str] = "bracket"
     summary: ClassVar[str] = "merges alternating exposures: clipped pixels come from the shorter one"

@@ -29,7 +29,7 @@ class Coverage(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring; the graph leaves the stage out if it is not requested."""
+        """Return the wiring; the graph leaves the stage out if coverage is not requested."""
         return Wiring(("pose", "objects", "surface_ids"), ("coverage",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:

@@ -17,7 +17,7 @@ from warp_ar.stages.shared.lighting import trace_variant
 
 
 class Declip(Stage):
-    """Estimates radiance above clipping, which another exposure shows; its methods are those of ``expose``."""
+    """Estimates the radiance of clipped pixels, which a shorter exposure shows; ``expose`` chooses the method."""
 
     name: ClassVar[str] = "declip"
     summary: ClassVar[str] = "estimates the radiance of clipped pixels by hue, depth and the ball"

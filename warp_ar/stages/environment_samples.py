@@ -21,7 +21,7 @@ from warp_ar.stages.shared.environment_sets import (
 
 
 class EnvironmentSamples(Stage):
-    """Draws directions in proportion to their light, again whenever the environment changes."""
+    """Draws directions by their radiance whenever the environment changes."""
 
     name: ClassVar[str] = "environment_samples"
     summary: ClassVar[str] = "directions sampled by the environment's light on the receiver"
@@ -71,7 +71,7 @@ class EnvironmentSamples(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return passes that sum and invert, and for the reference list the texels of a small map; ball after ball."""
+        """Return, for each ball, passes that draw samples; for the reference also one that lists a map's texels."""
         emitters = arrays["emitters"] if self.features.emitters else None
         passes = self._draw(arrays, 0, arrays["environment"], emitters)
         for ball in range(self.features.others):
@@ -80,7 +80,7 @@ class EnvironmentSamples(Stage):
         return passes
 
     def _draw(self, arrays: Arrays, ball: int, environment: Any, emitters: Any) -> list[Pass]:
-        """Return the passes from one map of the environment to its samples; maps share the sums in turn."""
+        """Return the passes from one map of the environment to its samples; the balls' passes reuse the same sums."""
         samples = arrays["environment_samples"]
         cumulative, sums = arrays["environment_samples_cumulative"], arrays["environment_samples_rows"]
         out = arrays["environment_samples_directions"], arrays["environment_samples_flux"], samples

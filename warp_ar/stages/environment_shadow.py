@@ -28,12 +28,12 @@ from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 
 def find_stride(method: Method, rows: int) -> int:
-    """Return the pixels between neighbouring estimates, which grow with the square root of the frame's rows."""
+    """Return the distance of neighbouring estimates, pixels; it grows with the square root of the frame's rows."""
     return int(cell_stride(method.stride, rows, slowly=True))
 
 
 def shadow_cells(features: Features) -> tuple[int, int]:
-    """Return the rows and columns of cells, with one estimate each."""
+    """Return the rows and columns of cells (blocks of pixels with one estimate each)."""
     size, method = features.request.size, METHODS[EnvironmentShadow.method_for(features)]
     rows, columns = cell_shape(size, find_stride(method, size[1]))
     return rows, columns
@@ -145,7 +145,7 @@ class EnvironmentShadow(Stage):
         ]
 
     def _cells(self, arrays: Arrays) -> ShadowCells:
-        """Return the stage's arrays as its kernels read and write them."""
+        """Return the ``ShadowCells`` of the stage's arrays."""
         names = "ratio", "bounced", "surface", "filtered"
         stride = find_stride(METHODS[self.method], self.height)
         return filled(ShadowCells(), stride=stride, **{name: arrays[f"{self.name}_{name}"] for name in names})

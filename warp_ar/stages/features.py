@@ -63,11 +63,11 @@ class Features:
     """Resources that are laid over the frame: of ``virtual``, ``added_light``, ``shadow_ratio``, ``mirror_ball``,
     ``reflected``; the last includes ``mirror_ball``."""
     exposed: bool
-    """True if the picture is shown at another exposure than the camera's."""
+    """True if the picture has another exposure than the camera's frame."""
     boxed: bool
     """True if a shorter exposure uses the mean of a pixel's surroundings."""
     declipped: bool
-    """True if radiance above clipping is estimated, which a shorter exposure shows."""
+    """True if the radiance of clipped pixels is estimated, because a shorter exposure shows it."""
     declipped_by_ball: bool
     """True if that estimate also uses the ball's light, with its recovered energy."""
     relight_method: str
@@ -129,7 +129,7 @@ class Features:
 
     @property
     def exposure_method(self) -> str:
-        """Variant of the exposure's kernel: a method that uses boxes, ``declipped`` or ``plain``."""
+        """Method of ``expose`` that runs: one that averages boxes, ``declipped`` or ``plain``."""
         if self.boxed:
             return self.request.quality.method("expose")
         return "declipped" if self.declipped else "plain"
@@ -157,7 +157,7 @@ def find_features(request: Request) -> Features:
     environment = has_environment(scene)
     observed = environment and scene.captured is None
     bracketed = observed and quality.method("recover") not in ("default", "clipped")
-    # Without a card or another modelled surface nothing measures clipped light.
+    # Clipped light is measured by its effect on the card or another modelled surface.
     # The surroundings of a ball that moves change with its place.
     still = all(probe.marker is None for probe in scene.probes)
     recovered = bracketed and still and (scene.has_marker or bool(scene.proxies))

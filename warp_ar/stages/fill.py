@@ -19,7 +19,7 @@ from warp_ar.stages.shared.probe_maps import KEPT, other_names
 
 
 class Fill(Stage):
-    """Completes the map, for all later stages or as the input of ``recover``."""
+    """Completes the environment map, which all later stages or ``recover`` read."""
 
     name: ClassVar[str] = "fill"
     summary: ClassVar[str] = (
@@ -78,7 +78,7 @@ class Fill(Stage):
     def _complete(
         arrays: Arrays, ball: int, known: tuple[Any, ...], most: float, proxies: tuple[int, ...]
     ) -> list[Pass]:
-        """Return the passes that complete the map of one ball; balls share the pyramid in turn."""
+        """Return the passes that complete the map of one ball; the passes of all balls reuse one pyramid."""
         radiance, confidence, filled = known
         shape = height, _ = radiance.shape
         levels = arrays["fill_levels"]

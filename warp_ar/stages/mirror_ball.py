@@ -34,7 +34,7 @@ SIDES: Mapping[str, int] = {"single": 1, "smooth": 2, "brute_force": 8}
 
 
 def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
-    """Return the configuration that a request's scene needs."""
+    """Return the kernel's configuration with only the features that the scene needs."""
     layers = features.layers
     shading = mirrored_shading(features) if "virtual" in layers else None
     lit = "added_light" in layers
@@ -47,7 +47,7 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
 
 
 def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallConfig:
-    """Return the configuration to compile; on a device with shared kernels it includes objects and lights."""
+    """Return the kernel's configuration to compile: the scene's own on CUDA, one for any scene on CPU."""
     if not shares_kernels(device):
         return mirror_config(features)
     return mirror_ball.MirrorBallConfig(
@@ -111,14 +111,14 @@ class MirrorBall(Stage):
         return Wiring(tuple(sorted(_reads(features, lit=features.lit))), ("mirror_ball",))
 
     def idle(self, reach: Reach) -> str | None:
-        """Return the reason why no ball shows a change; None if one may, also by objects outside the picture."""
+        """Return the reason that no ball shows a change, or None. Objects outside the picture may be reflected."""
         if not reach.balls:
             return "no mirror ball is in the picture"
         dark = not reach.falls and not self.request.scene.objects
         return "virtual light falls on nothing" if dark else None
 
     def reads_for(self, reach: Reach) -> tuple[str, ...]:
-        """Return the inputs; those for the receiver's response only if virtual light falls on it."""
+        """Return the inputs that are read: those of the receiver's response only if virtual light falls on it."""
         if reach.falls:
             return self.wiring.reads
         unlit = _reads(self.features, lit=False)

@@ -30,7 +30,7 @@ class Motion(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring; left out by the graph if not requested. The clock makes it run in every frame."""
+        """Return the wiring; the stage reads the clock, so it runs in every frame if motion is requested."""
         return Wiring(("pose", "objects", "clock", "surface_ids", "position"), ("motion",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:

@@ -31,7 +31,7 @@ def glossy_materials(scene: Scene) -> list[Material]:
 
 
 def scene_lobe(scene: Scene) -> Lobe:
-    """Return the common lobe: Phong if all glossy materials have it, else GGX, with the nearest widths."""
+    """Return the lobe for all glossy materials: Phong if all are Phong, else GGX of the nearest widths."""
     kinds = {type(material) for material in glossy_materials(scene)} - {MirrorMaterial}
     return "phong" if kinds == {PhongMaterial} else "ggx"
 
@@ -113,7 +113,7 @@ class Prefilter(Stage):
         return passes
 
     def _filter(self, arrays: Arrays, environment: Any, levels: Any) -> list[Pass]:
-        """Return the passes from one map of the environment to its levels; maps share the pyramid in turn."""
+        """Return the passes from one map of the environment to its levels; all maps reuse one pyramid."""
         height, device = self.request.quality.environment_height, environment.device
         lobe = scene_lobe(self.request.scene)
         if self._mirrors_only:
@@ -139,7 +139,7 @@ class Prefilter(Stage):
         ]
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
-        """Return passes that look up every lobe's directions in a sphere map level; only the first for mirrors."""
+        """Return one pass per lobe, which writes its map from a sphere map level; mirrors need the first lobe alone."""
         height = self.request.quality.environment_height
         lobes = lobe_count(height)
         known, out = (arrays["params"], arrays["sphere_map"]), arrays["prefilter_levels"]

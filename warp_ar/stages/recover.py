@@ -330,7 +330,7 @@ class Recover(Stage):
         return (kernels.make_trace_emitters_kernel(self._proxies),) if self.method == "shading" else ()
 
     def begin(self) -> None:
-        """Decide whether this frame begins an estimate, and whether one takes effect."""
+        """Decide whether this frame begins an estimate of clipped light, and whether a pending one takes effect."""
         now, seconds, covered = self._progress, self._arrays["seconds"](), self._arrays["ball_covered"]()
         now.frames += 1
         now.waited += 1
@@ -351,12 +351,16 @@ class Recover(Stage):
         self._follows = self._card > 0 and not covered
 
     def rest(self) -> None:
-        """Begin no estimate and apply none; the first frame that needs an estimate begins it at once."""
+        """Prepare a frame in which nothing reads the environment: no estimate of clipped light is begun or applied.
+
+        The first later frame in which ``begin`` is called may begin an estimate without waiting for ``EVERY_FRAME``
+        frames.
+        """
         self._asks = self._arrives = self._follows = False
         self._progress.rested = True
 
     def _ask(self, rows: Rows | None) -> None:
-        """Begin to solve; wait for the solution if it takes effect at once."""
+        """Begin an estimate from this frame's equations, and apply it at once if this frame must show it."""
         if self._worker is None:
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
         for side in (self._looks, self._camera):
@@ -379,7 +383,7 @@ class Recover(Stage):
 
     @property
     def _real_time(self) -> bool:
-        """True if frames never wait for an estimate."""
+        """True if frames never wait for an estimate of clipped light."""
         return self.request.estimates == "real_time"
 
     def _camera_place(self) -> npt.NDArray[np.float64]:
@@ -435,7 +439,7 @@ class Recover(Stage):
         return np.array(flat.reshape(points, count), np.float64)
 
     def _take(self, rows: Rows | None) -> None:
-        """Apply a finished estimate; after a failure the light stays, and the solver starts anew."""
+        """Apply the pending estimate; if it failed, keep the previous light and replace the solver by a new one."""
         now = self._progress
         assert now.pending is not None
         pending, now.pending, now.failed = now.pending, None, ""
@@ -468,12 +472,12 @@ class Recover(Stage):
                 wp.copy(then, asked, stream=self._frames_stream)
 
     def close(self) -> None:
-        """Wait for the worker, which uses the arrays that are freed next, and for which another stage may wait."""
+        """Wait until the worker thread, which uses the pipeline's arrays, has finished."""
         if self._worker is not None:
             self._worker.shutdown()
 
     def resume(self, other: Stage) -> None:
-        """Keep the known emitters and the estimate's times; search anew with another method or another receiver."""
+        """Take over the estimate and the solver's state, unless the method, marker, mirror balls or proxies differ."""
         if not isinstance(other, Recover) or other.method != self.method:
             return
         mine, yours = self.request.scene, other.request.scene
@@ -481,7 +485,7 @@ class Recover(Stage):
             self._progress = dataclasses.replace(other._progress)
 
     def status(self) -> Mapping[str, Any]:
-        """Return the evidence of the last estimate for reports, and the error of a later failed one (see ``_take``)."""
+        """Return the report of the last successful estimate, and the error text of a later one that failed."""
         estimate, failed = self._progress.estimate, self._progress.failed
         reason: dict[str, Any] = {"failed": failed} if failed else {}
         told = self._arrays["ball_reflectance"]()

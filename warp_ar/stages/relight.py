@@ -32,9 +32,9 @@ class Grain:
     ambient: int
     """Pixels per cell of ambient visibility, in frames of ``STRIDE_ROWS`` rows; 1: a cell per pixel of any frame."""
     bounced: int = 1
-    """Pixels per cell of bounced light, likewise."""
+    """Pixels per cell of bounced light, in frames of ``STRIDE_ROWS`` rows."""
     patch: int = 1
-    """Pixels per patch that reflects bounced light, likewise."""
+    """Pixels per patch that reflects bounced light, in frames of ``STRIDE_ROWS`` rows."""
 
 
 GRAINS: Mapping[str, Grain] = MappingProxyType(
@@ -48,7 +48,7 @@ GRAINS: Mapping[str, Grain] = MappingProxyType(
 
 
 class Relight(Stage):
-    """Adds the shadowed light of virtual lights on the proxies to the receiver in the frame."""
+    """Computes the radiance that virtual lights, with their shadows, add to the receiver in the frame."""
 
     name: ClassVar[str] = "relight"
     methods: ClassVar[Mapping[str, str]] = {
@@ -85,7 +85,7 @@ class Relight(Stage):
         return Wiring(relight_reads(features), ("added_light",))
 
     def runs_after(self) -> tuple[str, ...]:
-        """Return the stages to run before: with a near field, which waits longest for this stage, there are none."""
+        """Return ``environment_shadow``, or no stage if a near field would wait longer for this stage."""
         return () if self.features.near_field else ("environment_shadow",)
 
     def idle(self, reach: Reach) -> str | None:
@@ -134,7 +134,7 @@ class Relight(Stage):
         passes: list[Pass] = []
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
-            """Return a function of the cells' rows that the light's pixels read; other rows are never read."""
+            """Return a function that gives the rows of cells that pixels with virtual light read, plus ``margin``."""
 
             def extent() -> Rows:
                 start, stop = light_rows()
@@ -176,7 +176,7 @@ class Relight(Stage):
 
 
 def _keep_planes(config: RelightConfig, request: Request) -> RelightConfig:
-    """Keep the proxies' kinds if all are planes: most rays of the cells can then be left out."""
+    """Return ``config`` for planes alone if all proxies are planes: most rays of the cells are then left out."""
     proxies = trace_config(request.scene).proxies
     if not set(proxies) <= {int(PLANE)}:
         return config
@@ -204,7 +204,7 @@ def _strides(features: Features) -> dict[str, int]:
 
 
 def make_cells(features: Features, arrays: Arrays) -> ReceiverCells:
-    """Return the cells of a request as kernels read them."""
+    """Return the ``ReceiverCells`` of the stage's arrays."""
     cells = {}
     for name, stride in _strides(features).items():
         values, surface = arrays[f"relight_{name}"], arrays[f"relight_{name}_surface"]

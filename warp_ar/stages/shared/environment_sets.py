@@ -14,7 +14,7 @@ REFERENCE_SIZE: Final = (32, 64)
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """Number of rays per estimate and of estimates per frame."""
+    """Numbers of rays per estimate and of estimates per frame, for one method of ``environment_shadow``."""
 
     count: int
     """Samples of the environment per estimate."""
@@ -25,7 +25,7 @@ class Method:
     bounce: Literal["estimated", "traced"]
     """Method for light that objects reflect onto the receiver."""
     secondary: float = 1.0
-    """Share of the rays that search for light reflected by objects; it is smooth, so that half of them suffice."""
+    """Share of the rays for which light reflected by objects is found; that light is smooth, so half may suffice."""
 
 
 METHODS: Mapping[str, Method] = {
@@ -37,7 +37,7 @@ METHODS: Mapping[str, Method] = {
 
 
 SAMPLES = 1024
-"""Least number of samples of all sets together: four times the 8-bit steps of the mean over the sets."""
+"""Least total number of samples of all sets: four per step of an 8-bit value."""
 
 
 def lists_texels(features: Features) -> bool:

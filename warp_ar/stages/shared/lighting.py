@@ -22,31 +22,31 @@ from warp_ar.stages.shared.picture import find_picture, frame_reads
 
 
 def shares_kernels(device: Any) -> bool:
-    """Return True if kernels on ``device`` serve any scene: on CPU, where variants cost more than they save."""
+    """Return True if one compiled kernel serves all scenes: on CPU, where compiling special kernels costs too much."""
     return bool(device.is_cpu)
 
 
 def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:
-    """Return the shape kinds to compile."""
+    """Return the key of the compiled kernel: the scene's kinds of shape or, on CPU, all kinds."""
     return config.general() if shares_kernels(device) else config
 
 
 def distant_variant(features: Features, device: Any) -> DistantLightConfig:
-    """Return the shapes, materials and forms of the environment to compile."""
+    """Return the key of the compiled kernel: shapes, materials and forms of the environment; on CPU, for any scene."""
     if not shares_kernels(device):
         return features.distant
     return features.distant.general(_form(features))
 
 
 def shade_variant(config: ShadeConfig, features: Features, device: Any) -> ShadeConfig:
-    """Return the variant as ``distant_variant``, with the kinds of virtual light."""
+    """Return the key of the compiled kernel: ``config`` or, on CPU, that of any scene with all kinds of light."""
     if not shares_kernels(device):
         return config
     return config.general(_form(features), soft=_asks_soft(features))
 
 
 def relight_variant(config: RelightConfig, features: Features, device: Any) -> RelightConfig:
-    """Return the shapes and shadows to compile."""
+    """Return the key of the compiled kernel: ``config`` or, on CPU, that of any kinds of shape."""
     if not shares_kernels(device):
         return config
     return config.general(soft=_asks_soft(features))
@@ -74,7 +74,7 @@ def distant_light_reads(features: Features) -> tuple[str, ...]:
 
 
 def _other_reads(features: Features) -> tuple[str, ...]:
-    """Return the resources with these forms for the balls after the first, and the places of all balls."""
+    """Return the resources of the environment at the balls after the first, and of all balls' positions."""
     config = features.distant
     if not config.several or (config.diffuse == "none" and not config.specular):
         return ()
@@ -91,7 +91,7 @@ def _make_dfg() -> Any:
 
 
 def make_distant_light(features: Features, arrays: Arrays) -> DistantLight:
-    """Return the environment as the kernels of a stage read it."""
+    """Return the ``DistantLight`` of the arrays that hold the environment."""
     config, names = features.distant, _other_reads(features)
     form = f"irradiance_{config.diffuse}"
     return filled(
@@ -121,7 +121,7 @@ def make_other_balls(features: Features, arrays: Arrays, names: Iterable[str]) -
 def find_receiver(
     config: RelightConfig, features: Features, arrays: Arrays, reads: Sequence[str], cells: ReceiverCells | None = None
 ) -> Receiver:
-    """Return the receiver as kernels read it, for a stage that reads the named resources."""
+    """Return the ``Receiver`` of the arrays named in ``reads``, the resources that the stage reads."""
     names = {"key_lights": "key_lights", "irradiance": features.irradiance, "emitters": "emitters"}
     known = {word: arrays[name] for word, name in names.items() if name in reads}
     others = make_other_balls(features, arrays, reads)

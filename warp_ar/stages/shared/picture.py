@@ -35,7 +35,7 @@ def find_visible(arrays: Arrays) -> VisibleObjects:
 
 
 def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:
-    """Return the existing layers as kernels read them."""
+    """Return the ``Layers`` of those layers that exist in ``arrays``."""
     mirror_ball = "reflected" if "reflected" in arrays else "mirror_ball"
     names = ("virtual", "added_light", "shadow_ratio", mirror_ball)
     return composite.make_layers(*(arrays.get(name) for name in names))
@@ -61,14 +61,14 @@ def clipped_evidence(request: Request, wiring: Wiring, arrays: Arrays) -> Clippe
 
 
 class GrowingRows:
-    """Rows of this frame and of the previous one: pixels that content has left must be cleared."""
+    """Function that returns the rows of content in this frame and the previous one, which must be cleared."""
 
     def __init__(self, current: Callable[[], Rows]) -> None:
         self._current = current
         self._previous: Rows = (0, 0)
 
     def __call__(self) -> Rows:
-        """Return the rows to process; called once per frame."""
+        """Return the band of rows that holds this frame's and the previous frame's content; called once per frame."""
         rows, previous = self._current(), self._previous
         self._previous = rows
         if previous[0] >= previous[1]:

@@ -22,7 +22,7 @@ def find_view(arrays: Arrays, name: str) -> EnvironmentView:
 
 
 def other_views(features: Features, arrays: Arrays, name: str) -> list[EnvironmentView]:
-    """Return these maps for each ball after the first; none if light is not interpolated between balls."""
+    """Return the ``EnvironmentView`` of each ball after the first; none if light is not interpolated between balls."""
     maps = [arrays[f"{name}_{part}"] for part in UNWRAPPED] if features.others else []
     return [make_environment_view(*(one[ball] for one in maps)) for ball in range(features.others)]
 
