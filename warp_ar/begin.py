@@ -50,7 +50,7 @@ def begin(name: str) -> NoReturn:
 
 
 def live() -> NoReturn:
-    """Run ``warp-ar``, the installed program, as ``python -m warp_ar.live``."""
+    """Run the installed program ``warp-ar``, which is the command ``python -m warp_ar.live``."""
     begin("warp_ar.live")
 
 
@@ -76,7 +76,7 @@ def importing() -> Iterator[None]:
 
 
 def _heeded() -> list[str]:
-    """Return names of the signals that end a process, except those that the parent process ignores."""
+    """Return the names of the signals that end this process; signals that the parent set to be ignored are left out."""
     names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [name for name in names if signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN]
 

@@ -2,7 +2,8 @@
 
 card      writes the card, or a marker or board, as a PDF or PNG that prints at true size
 camera    pictures of a ChArUco board to an OpenCV YAML file, which ``--calibration`` and a scene's ``calibration``
-read ball      frames of a scene to its mirror ball's centre, for the scene's ``[probe]``
+          read
+ball      frames of a scene to its mirror ball's centre, for the scene's ``[probe]``
 response  pictures of the card's greys, or of any scene at several exposures, to a response curve, for the scene's
           ``transfer``
 """

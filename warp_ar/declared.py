@@ -78,7 +78,7 @@ def words_for(hint: Any) -> str:
 
 
 def show(value: object) -> str:
-    """Return a value as text for messages."""
+    """Return a short text of a value for messages."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:60]}..."
 

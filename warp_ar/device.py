@@ -32,7 +32,7 @@ _TRANSLATION = threading.RLock()
 ASK_EVERY = 1e-4
 """Seconds between two polls of an event."""
 LONGEST_ASKING = 0.25
-"""Seconds of polling after which CUDA's own wait is called."""
+"""Seconds of polling an event after which CUDA's own wait, which keeps a core busy, is called."""
 _STARTED: list[int] = []
 """Process id in which Warp was started; empty before that."""
 _OPENING: list[threading.Thread] = []
@@ -108,7 +108,7 @@ def capturing() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _asking() -> Iterator[None]:
-    """Context for calls that CUDA forbids while a graph is captured."""
+    """Context for calls, such as waiting for an event, that CUDA forbids while a graph is captured."""
     now = _CAPTURES
     with now.changed:
         now.changed.wait_for(lambda: not now.capturing)
@@ -196,7 +196,7 @@ def open_ahead(name: str) -> None:
     """Create a CUDA device's context on a thread while this one imports modules; ``resolve_device`` waits for it.
 
     Args:
-        name: As for ``resolve_device``. If it is no CUDA device of this machine, nothing is done.
+        name: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``. If it is no CUDA device of this machine, nothing is done.
     """
     known = [str(device) for device in wp.get_devices() if device.is_cuda]
     wanted = "cuda:0" if name in ("auto", "cuda") else name

@@ -123,8 +123,8 @@ def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]
 def look_for_polish(scene: Scene, look: Look, tell: Callable[[str], object] | None = None) -> TablePolish | None:
     """Measure the reflection of a table from frames; return the result in words and the keys to write.
 
-    scene: A scene with a card, a mirror ball and a plane.
-        scene: With a card, a mirror ball and a plane.
+    Args:
+        scene: Scene with a card, a mirror ball and a plane.
         look: Frames of the scene.
         tell: Function that receives a line about the measurement in progress, for people.
 

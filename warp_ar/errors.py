@@ -35,10 +35,10 @@ class UpdateError(UsageError):
 
 
 def check_process(what: str, process: int) -> None:
-    """Check that this process is the one in which something with threads or a device was made.
+    """Check that this process made an object with threads or a device; ``what`` names it, ``process`` is its process.
 
     Raises:
-        UsageError: It is a fork of that one.
+        UsageError: This process is a fork of the one with the id ``process``.
     """
     if os.getpid() != process:
         raise UsageError(

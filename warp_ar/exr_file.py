@@ -94,7 +94,7 @@ def read_linear_picture(path: pathlib.Path, error: type[WarpArError], label: str
 
 
 def read_exr_header(path: pathlib.Path, error: type[WarpArError], label: str) -> dict[str, Any]:
-    """Return the attributes of an OpenEXR picture; arguments as for `read_linear_picture`.
+    """Return the attributes of an OpenEXR picture; `read_linear_picture` describes the arguments.
 
     Raises:
         WarpArError: As ``error``: the file does not exist, is too large or cannot be read.

@@ -320,7 +320,7 @@ def store(
 
 
 def name_aside(path: pathlib.Path, suffix: str = "") -> pathlib.Path:
-    """Return a hidden, random path next to ``path`` for a file that takes that name when it is complete.
+    """Return a hidden, random path next to ``path``, for a file that is renamed to ``path`` when it is complete.
 
     Args:
         path: Final path (see `take_name`).

@@ -35,7 +35,7 @@ DEFAULT_RADIUS = 0.035
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The command's options."""
+    """Return the parser of the command's options."""
     parser = Parser(
         prog="python -m warp_ar.init",
         description="Make a folder to start from: a scene file, a teapot, the card to print.",

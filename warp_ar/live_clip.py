@@ -315,10 +315,10 @@ class _Clip:
         say(message)
 
     def _check(self) -> None:
-        """Check that the run showed the marker and the ball, and changed frames, where its scene calls for it.
+        """Check that frames showed the marker and the ball and were changed, each where the scene needs it.
 
         Raises:
-            RunError: It did not.
+            RunError: A check failed.
         """
         from warp_ar.checks.checkup import ball_is_seen
 

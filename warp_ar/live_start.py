@@ -41,7 +41,7 @@ def start_device(name: str) -> None:
     """Start Warp, and create a CUDA device's context during the imports that follow.
 
     Args:
-        name: As for ``resolve_device``.
+        name: ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
     """
     from warp_ar.device import open_ahead, start_warp
 

@@ -92,7 +92,7 @@ def read_raw(path: str | os.PathLike[str], error: type[WarpArError]) -> npt.NDAr
     The white balance is the camera's as shot. The largest code is the sensor's saturation, whatever the picture shows.
 
     Raises:
-        WarpArError: As `open_raw`.
+        WarpArError: As ``error``: rawpy is not installed, or the file is too large, damaged or no raw photograph.
     """
     with open_raw(path, error) as raw:
         raw.unpack()
@@ -115,7 +115,7 @@ def picture_size(data: bytes) -> Size | None:
 def read_picture(
     path: str | os.PathLike[str], flags: int, error: type[WarpArError], label: str | None = None
 ) -> npt.NDArray[Any]:
-    """Decode a picture file; arguments and errors as `decode_picture`."""
+    """Decode a picture file; `decode_picture` describes arguments, result and errors."""
     label = str(path) if label is None else label
     return decode_picture(read_bytes(path, "picture_bytes", error, label), flags, error, label)
 

@@ -141,7 +141,7 @@ def _size(text: str) -> tuple[int, int]:
 def render(
     tracer: PathTracer, samples: int, error: float | None, console: Console, pictures: list[TracedPicture]
 ) -> None:
-    """Trace paths with a progress display; each new picture is appended to ``pictures``."""
+    """Trace paths and show the progress; after each step, ``pictures`` holds the latest picture alone."""
     text = TextColumn("{task.description}")
     with Progress(text, BarColumn(), TimeRemainingColumn(), console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("reflectance", total=samples)

@@ -1,1 +1,1 @@
-"""From a request to lit frames: graph, scheduler, pipeline, transfers."""
+"""Pipeline that lights frames: planning of stages, their execution, their inputs, and transfers to the device."""

@@ -15,7 +15,7 @@ from warp_ar.stages.quality import Quality
 
 
 def check_number(name: str, value: object, above: float = -math.inf) -> None:
-    """Check an argument that is a number of seconds.
+    """Check that an argument, a number of seconds, is finite and greater than ``above``.
 
     Raises:
         UsageError: The value is no finite number, or not above the bound.

@@ -29,7 +29,7 @@ _Table = npt.NDArray[np.int64]
 
 
 class _Packed:
-    """Recorded launch, with the arguments of its compiled entry point."""
+    """Recorded kernel launch, with the packed arguments of the kernel's compiled function."""
 
     def __init__(self, launch: wp.Launch) -> None:
         names = [argument.label for argument in launch.kernel.adj.args]
@@ -181,7 +181,7 @@ class CpuThreads:
         )
 
     def _pack(self, step: Pass, notes: list[Note]) -> list[dict[str, int]] | None:
-        """Return the rows of the call table for a pass; None if it must be launched from Python."""
+        """Return one row of the call table for each launch of a pass; None if the pass must be launched from Python."""
         rows = []
         for note in notes:
             banded = note.rows is not None
@@ -259,7 +259,7 @@ class CpuThreads:
         return _Packed(wp.launch(bands.serve_kernel, 1, inputs, [out], device="cpu", record_cmd=True))
 
     def _call_back(self, number: int) -> int:
-        """Run a step in Python on the calling thread; return 1 if it failed, else 0."""
+        """Run the step with index ``number`` in Python, on the calling thread; return 1 if it failed, else 0."""
         try:
             self._host_steps[number]()
         except BaseException as error:  # raised again on the thread that runs the frame

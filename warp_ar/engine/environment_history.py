@@ -14,15 +14,15 @@ from warp_ar.kernels.structs import struct_values
 from warp_ar.stages.base import Arrays
 
 KEPT_ARRAYS = ("others_kept_radiance", "others_filled")
-"""Arrays with the remembered radiance of the mirror balls after the first; stages carry them over."""
+"""Arrays with the remembered radiance of the second and further mirror balls, copied to a new pipeline by stages."""
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
-"""Arrays of the environment that are remembered."""
+"""Arrays of the environment that ``CarriedLight.take_over`` resamples into a new pipeline."""
 SCALED_ARRAYS = ("environment_radiance", "filled_radiance", "recover_recovered", *KEPT_ARRAYS)
-"""Arrays of radiance that persist between frames (the filled map while something covers a ball)."""
+"""Arrays of radiance that persist between frames; ``filled_radiance`` does so only while something covers a ball."""
 
 
 class CarriedLight:
-    """Light that a pipeline has seen, with a mark whether there is any."""
+    """Environment that a pipeline has captured so far; ``known`` tells whether there is any."""
 
     def __init__(self, arrays: Arrays, *, wanted: bool) -> None:
         """Take the pipeline's arrays; ``wanted``: the environment is one of the outputs."""
@@ -37,7 +37,7 @@ class CarriedLight:
 
     @property
     def others(self) -> Any:
-        """Return the environments of the mirror balls after the first, (P - 1, rows, columns); None for one map."""
+        """Return the environments of balls 2 to P, (P - 1, rows, columns); None if there is only one environment."""
         return self._arrays.get("others_environment") if self.environment is not None else None
 
     def scale(self, ratio: npt.NDArray[np.float64]) -> None:

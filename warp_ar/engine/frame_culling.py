@@ -16,10 +16,10 @@ from warp_ar.stages.base import Reach, Stage
 
 
 class FrameCulling:
-    """Examines a plan's stages before every frame; remembers the stages whose arrays are clear."""
+    """Examines a plan's stages before every frame; remembers the stages whose arrays hold their neutral output."""
 
     def __init__(self, stages: Sequence[Stage], outputs: Collection[str]) -> None:
-        """Prepare.
+        """Prepare for a plan, none of whose arrays is clear yet.
 
         Args:
             stages: Stages of the plan, in the order in which they run.
@@ -31,12 +31,12 @@ class FrameCulling:
         """Reach and result of the last frame, valid for the next with the same reach; None after clearing."""
 
     def forget(self) -> None:
-        """Forget which stages' arrays are clear."""
+        """Treat no stage's arrays as clear (holding their neutral output)."""
         self._clear.clear()
         self._last = None
 
     def look(self, reach: Reach) -> tuple[Mapping[str, str], Collection[str]]:
-        """Return the stages that rest in a frame and those that clear their arrays.
+        """Return the stages that do not run in a frame, and those that run to write their neutral output.
 
         Args:
             reach: Parts of the frame that virtual objects and lights can reach.

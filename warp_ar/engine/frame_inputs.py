@@ -50,7 +50,7 @@ class SeenFrame:
     image: Any
     """Image of the caller, or a copy of it."""
     slot: Slot | None
-    """Slot from which it is sent to the device, if its transfer has begun."""
+    """Slot of ``Transfers`` that holds the image, if the transfer to the device has begun; else None."""
     pose: Pose | None
     lost: bool
     index: int
@@ -68,7 +68,7 @@ class SeenFrame:
 
 
 class FrameInputs:
-    """Owner of the stages' inputs: writes them before a frame is rendered, and marks those that changed."""
+    """Inputs of the stages: written before a frame is rendered, and marked if they changed."""
 
     def __init__(
         self,
@@ -188,7 +188,7 @@ class FrameInputs:
         return ratio, self._note_reflectance(frame, frame.pose) or is_bent
 
     def _look_for_drift(self, frame: SeenFrame, pose: Pose) -> tuple[npt.NDArray[np.float64] | None, bool]:
-        """Update the estimate of the camera's gain and tone curve; returns as ``look``."""
+        """Update the estimate of the camera's gain and tone curve; return the two values that ``look`` describes."""
         if self._drift is None:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
@@ -241,7 +241,7 @@ class FrameInputs:
         self._have_lights_shine()
 
     def _have_lights_shine(self) -> None:
-        """Scale virtual lights to the camera: their unit is its saturation level, and follows its gain."""
+        """Set the unit of virtual lights: the largest value at which a channel saturates, times the camera's gain."""
         levels, codes = self.saturation.levels, np.arange(256)
         white = max(float(np.interp(levels[c], codes, self.decode[:, c])) for c in range(3))
         self.host_scene.set_gain(white * self.gain)
@@ -297,7 +297,7 @@ class FrameInputs:
             self._arrays.touch(name)
 
     def fix_saturation(self, levels: npt.NDArray[np.float64]) -> None:
-        """Set the codes at which channels saturate, (3,); they are no longer estimated from frames."""
+        """Set the 8-bit values at which channels saturate, (3,), and stop estimating them from frames."""
         self.saturation.levels = np.asarray(levels, np.float64)
         self._saturation_is_known = True
         self._write_decode()
@@ -388,11 +388,11 @@ class FrameInputs:
         return outlines
 
     def _rows(self, name: str) -> Rows:
-        """Return the rows of one of ``RECTS`` in this frame."""
+        """Return the rows of the picture that a rectangle of ``RECTS`` covers in this frame."""
         return self.rects[name][:2]
 
     def reach(self) -> Reach:
-        """Return the parts of this frame that virtual objects and lights can reach."""
+        """Return the parts of this frame that virtual objects and lights can change."""
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
         falls = bool(self.host_scene.light_outline().polygons)
@@ -442,7 +442,7 @@ class FrameInputs:
 
 
 def _probe_values(probes: Sequence[scenes.Probe], reflectances: Sequence[scenes.RGB] | None = None) -> npt.NDArray[Any]:
-    """Return records of the balls; ``reflectances`` None: those of the scene."""
+    """Return the kernels' records of the balls; with ``reflectances`` None they hold the scene's reflectances."""
     values = np.zeros(len(probes), struct_dtype(Probe))
     told = [probe.reflectance for probe in probes] if reflectances is None else reflectances
     for value, probe, reflectance in zip(values, probes, told, strict=True):

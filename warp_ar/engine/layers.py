@@ -22,14 +22,14 @@ OUTPUTS = ("image", "environment", "pose", RADIANCE)
 """Outputs that are not layers."""
 
 _COMPONENTS = {"objects": 4, "coverage": 8, "motion": 2, "ids": 0, "depth": 0}
-"""Components per pixel of the layers that do not have three; 0: a scalar array."""
+"""Components per pixel of a layer, by name; 0: a scalar array. Layers that are not listed have three."""
 
 
 def check_outputs(outputs: Sequence[str]) -> None:
     """Check the names of outputs.
 
-    UsageError: No output has that name.
-        UsageError: There is no output of that name.
+    Raises:
+        UsageError: A name is unknown.
     """
     known = (*OUTPUTS, *LAYERS)
     for name in outputs:
@@ -49,7 +49,9 @@ class LayerArrays:
     """Array (1,) of the exposure's scale; None: the scale is 1."""
 
     def with_plate(self, radiance: npt.NDArray[np.float32], clip: npt.NDArray[np.float32]) -> LayerArrays:
-        """Return the layers with the plate at its full bit depth; clipped pixels keep the estimate of the plate layer.
+        """Return the layers with the plate, the frame before anything virtual, at its full bit depth.
+
+        Channels that clip take the larger of ``radiance`` and the layer, in which clipped values are estimated.
 
         Args:
             radiance: Plate at full depth, (height, width, 3).

@@ -110,7 +110,7 @@ def _load(variant: _Variant) -> None:
 
 
 def _folder_of(variant: _Variant) -> Path:
-    """Return the cache folder of a module's files."""
+    """Return the folder of Warp's cache for the compiled files of a module."""
     module, device, size = variant
     return Path(wp.config.kernel_cache_dir, module.get_module_identifier(1 if device == "cpu" else size))
 

@@ -183,7 +183,7 @@ class Pipeline(Closing):
         self._build(Arrays(), {})
 
     def _follows_gain(self) -> bool:
-        """Return True if drifts of the camera's gain are followed."""
+        """Return True if drifts of the camera's gain (exposure and white balance) are estimated from frames."""
         follows = self._follows_camera
         if follows is None:
             follows = self.scene.source is not None and self.scene.source.metering == "automatic"
@@ -240,7 +240,7 @@ class Pipeline(Closing):
 
     @_in_turn
     def close(self) -> None:
-        """Stop the worker threads. Arrays are freed with the last result that refers to them."""
+        """Stop the worker threads. The arrays are freed once no ``Result`` refers to them."""
         if self._closed or os.getpid() != self._process:
             return  # a fork has neither the threads nor the device
         self._closed = True
@@ -272,7 +272,7 @@ class Pipeline(Closing):
         add or remove a stage, an array or a kernel need ``change``.
 
         Args:
-            scene: The new scene; its camera is scaled as it was in the constructor.
+            scene: The new scene; its camera is scaled to the size of the frames.
 
         Raises:
             UpdateError: Something other than numbers differs; the message names it, and nothing has changed.
@@ -293,7 +293,12 @@ class Pipeline(Closing):
 
     @checked
     def _check_next(self, scene: Scene) -> Scene:
-        """Finish submitted frames; return the next scene with its camera scaled to the size of the frames."""
+        """Check that the pipeline is usable, wait for submitted frames, and fit the scene's camera to the frame size.
+
+        Raises:
+            UsageError: The pipeline is closed or belongs to another process.
+            SceneError: The scene's camera does not fit the size of the frames.
+        """
         self._check_usable()
         self._finish()
         return dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
@@ -367,7 +372,7 @@ class Pipeline(Closing):
         self.change(dataclasses.replace(self.scene, objects=tuple(edit(self.scene.objects))))
 
     def _go_on(self, other: Pipeline) -> None:
-        """Take over another pipeline's track, if it fits, and its estimates from frames."""
+        """Take over another pipeline's track of the marker, if it fits, and the estimates that it made from frames."""
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
         if self.camera == other.camera and own_markers(self.scene) == own_markers(other.scene):
@@ -531,7 +536,7 @@ class Pipeline(Closing):
         return result
 
     def _take_depth(self, image: Any) -> tuple[DeepFrame | None, Any]:
-        """Return the frame at full depth, None if it has 8 bits, and its 8-bit codes."""
+        """Return the frame at its full bit depth (None for an 8-bit frame), and as 8-bit pixel values."""
         if not self.plan.request.linear:
             if isinstance(image, np.ndarray) and image.dtype != np.uint8 and image.dtype.kind in "uf":
                 width, height = self.size
@@ -576,7 +581,7 @@ class Pipeline(Closing):
         return Result(frame.pose, state, (self._keep(rendered) if ahead else rendered).at_once())
 
     def _send(self, frame: SeenFrame) -> SeenFrame:
-        """Start a frame's transfer to the device, unless it is there already."""
+        """Start the transfer of a frame to the device, unless the image is there already; return the updated frame."""
         if self.inputs.transfers is None or frame.lost or isinstance(frame.image, wp.array):
             return frame
         frame.slot = self.inputs.transfers.upload(frame.image)
@@ -611,7 +616,7 @@ class Pipeline(Closing):
             self._ahead.popleft().result()
 
     def _keep(self, rendered: Rendered) -> Rendered:
-        """Start the picture's transfer to the host, or copy the light, so that they outlast the next frame."""
+        """Copy the outputs of a frame to the host, or start their transfer, before the next frame overwrites them."""
         lit, transfers = rendered.image_array, self.inputs.transfers
         if rendered.layers is not None:
             rendered = dataclasses.replace(rendered, layers=rendered.layers.to_host())
@@ -717,7 +722,10 @@ class Pipeline(Closing):
         given: Pose | Track | None,
         deep: DeepFrame | None,
     ) -> Result:
-        """Measure light from a frame of another exposure, unless the plan has no ``bracket``; the picture stays."""
+        """Measure light from a frame of another exposure than the shown one; return the last shown picture.
+
+        The light is measured only if the plan has the stage ``bracket``, which merges exposures.
+        """
         timings: dict[str, StageTiming] = {}
         bright: Any = image
         if self._shown is None or (self._tracker is not None and given is None):

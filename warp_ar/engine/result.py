@@ -58,7 +58,7 @@ class Rendered:
         return dataclasses.replace(self, environment=light, others=others, emitters=emitters)
 
     def at_once(self) -> Future[Rendered]:
-        """Return this output as a completed future."""
+        """Return a completed future that holds this output."""
         future: Future[Rendered] = Future()
         future.set_result(self)
         return future

@@ -27,7 +27,7 @@ class SceneObjects:
         self._objects, self._edit = objects, edit
 
     def __repr__(self) -> str:
-        """Return the key and shape of every object."""
+        """Return a text with the shape of every object by its name or index."""
         shapes = {item.name or index: item.shape for index, item in enumerate(self._objects())}
         return f"SceneObjects({shapes})"
 
@@ -90,7 +90,7 @@ class SceneObject:
         self._objects, self._edit, self._key = objects, edit, key
 
     def __repr__(self) -> str:
-        """Return the key; the object itself may have been removed."""
+        """Return a text with the object's name or index. The object is not looked up, as it may have been removed."""
         return f"SceneObject({self._key!r})"
 
     @property

@@ -116,7 +116,7 @@ class Scheduler:
         return spare
 
     def launch_first(self, notes: Iterable[Note]) -> None:
-        """Add launches to run once before the first frame, before those of the stages."""
+        """Add recorded launches that run once, before the first launch of any stage."""
         self._first_launches += notes
 
     def close(self) -> None:
@@ -156,7 +156,7 @@ class Scheduler:
                     self.arrays.touch(name)
 
     def continue_from(self, other: Scheduler) -> None:
-        """Copy the remembered state of the same stages of another plan, where it fits."""
+        """Copy the state that stages keep between frames from another plan's stages of equal name and shapes."""
         others = {stage.name: stage for stage, _ in other._stages}
         for stage, _ in self._stages:
             if stage.name not in others or others[stage.name] is stage:
@@ -169,7 +169,7 @@ class Scheduler:
                 stage.resume(others[stage.name])
 
     def constants(self) -> dict[Any, Any]:
-        """Return the filled tables, which the next pipeline may share."""
+        """Return the arrays of constants, such as tables, for a next pipeline to share; none before ``prepare``."""
         return self.arrays.constants if self._prepared else {}
 
     def spare(self) -> dict[str, Any]:
@@ -181,7 +181,7 @@ class Scheduler:
         return {name: array for name, array in self.arrays.items() if name in self._fills and name not in needed}
 
     def _remembered(self, stage: Stage) -> list[str]:
-        """Return the names of a stage's arrays with remembered state; a method need not have all of them."""
+        """Return the names of the existing arrays in which a stage keeps state between frames."""
         return [name for name in stage.remembers if name in self.arrays]
 
     def prepare(self, progress: Progress | None = None) -> None:
@@ -229,7 +229,7 @@ class Scheduler:
         its steps.
 
         Args:
-            progress: As for ``prepare``.
+            progress: Receives the numbers of compiled modules and of all modules to compile.
         """
         self.prepare(progress)
         self._frame_culling.forget()
@@ -325,7 +325,7 @@ class Scheduler:
         self._translated.add(id(step))
 
     def _run_captured(self, due: list[Step]) -> dict[str, float]:
-        """Replay the graphs of these passes, captured where they are new; return milliseconds by stage."""
+        """Replay the CUDA graphs of these passes, after capturing those that are new; return milliseconds by stage."""
         key = tuple(id(step) for _, steps in due for step in steps)
         if key not in self._patterns:
             self._patterns[key] = _segments(due)

@@ -115,6 +115,6 @@ class ShortFrames:
         return self._merged > before
 
     def resume(self, other: ShortFrames) -> None:
-        """Continue with the exposures that another pipeline has received; its arrays have been copied if they fit."""
+        """Take over the times of another pipeline's frames if its exposures are equal; its arrays are copied before."""
         if self._ratios == other._ratios:
             self._taken, self._merged = list(other._taken), other._merged

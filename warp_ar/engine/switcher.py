@@ -161,7 +161,7 @@ class PipelineSwitcher:
             The pipeline for the next frame: the previous one while the new one is built; None if there is none.
 
         Raises:
-            WarpArError: As for ``take``.
+            WarpArError: The requested pipeline cannot be built; the previous one stays in use.
         """
         self.want(target, prepare)
         return self.take()
@@ -255,7 +255,7 @@ class PipelineSwitcher:
 
 
 def _fits(pipeline: Pipeline, target: Target) -> bool:
-    """Return True if a pipeline fits a target, after an update of its numbers if that is sufficient."""
+    """Return True if a pipeline fits a target; numbers that differ are first written into the pipeline."""
     request = pipeline.plan.request
     camera = target.scene.camera
     size = (camera.width, camera.height) if target.size is None else target.size

@@ -95,7 +95,7 @@ class CardLight:
 
     @property
     def words(self) -> str:
-        """Return irradiance from above with its interval, and the main direction, in one line."""
+        """Return one line of text with the irradiance from above, its interval, and the main direction of the light."""
         value, half = (float(part.mean()) for part in self.irradiance(np.array([[0.0, 0.0, 1.0]])))
         x, y, z = self.main_direction
         told = f"from above {value:.2f} +- {half:.2f} camera values, mainly from ({x:.2f}, {y:.2f}, {z:.2f})"

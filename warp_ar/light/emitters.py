@@ -42,7 +42,7 @@ MOST_STEPS = 4
 
 
 def room(distance: float) -> float:
-    """Return twice the logarithm of the prior volume at a distance in metres, up to a constant."""
+    """Return 6 log d, the amount by which the prior lowers the cost of an emitter at a distance d in metres."""
     return 6.0 * float(np.log(min(distance, CONFIG.search.farthest)))
 
 
@@ -50,7 +50,7 @@ class EmitterSearch:
     """Adds emitters to a problem's unknowns and moves them, using all channels."""
 
     def __init__(self, problem: Problem, means: Array) -> None:
-        """Start a search for emitters of ``problem``; ``means`` (3,) are the common means by the card alone."""
+        """Start a search in ``problem``; ``means`` (3,) is the common missing radiance that the card alone implies."""
         self.problem, self.means = problem, means
         search = CONFIG.search
         self.evidence = search.evidence * max(problem.texture / search.even, 1.0) ** search.textured
@@ -61,7 +61,10 @@ class EmitterSearch:
         return fit_channels(self.problem, self.problem.start(self.means), CONFIG.solver.iterations)
 
     def gains(self, fits: Fits, columns: Array) -> Array:
-        """Return second-order decreases of the costs by each of ``columns`` (points, q) as one more unknown, (3, q)."""
+        """Return each channel's decrease of cost, to second order, by each of ``columns`` as an added unknown, (3, q).
+
+        ``columns``, (points, q), is the irradiance of each point per unit power of q candidates.
+        """
         equations, found = fits.equations, []
         for c in range(3):
             free = fits.z[c] > 0.0

@@ -220,7 +220,7 @@ def _powers(estimate: Estimate) -> dict[tuple[int, float], NDArray[np.float64]]:
 
 
 def _mixed_seen(before: Seen, now: Seen, weight: float) -> Seen:
-    """Return a mean of observed light; points that come into view start with their current value."""
+    """Return the mean of observed light, with ``weight`` for ``now``; a point seen in one only has its value there."""
     shown = np.where(before.told & now.told, before.shown + weight * (now.shown - before.shown), now.shown)
     shown = np.where(before.told & ~now.told, before.shown, shown)
     environment = before.environment + weight * (now.environment - before.environment)
@@ -228,7 +228,10 @@ def _mixed_seen(before: Seen, now: Seen, weight: float) -> Seen:
 
 
 def _mixed(mean: Estimate, now: Estimate, weight: float) -> Estimate:
-    """Return a mean of light and powers; other fields, and cells that start or stop missing light, are the newer's."""
+    """Return the mean of two estimates' missing radiance, emitter powers and irradiance, with ``weight`` for ``now``.
+
+    Other fields are those of ``now``, as are cells that miss light in only one of the two.
+    """
     both = (mean.recovered > 0.0) & (now.recovered > 0.0)
     recovered = np.where(both, mean.recovered + weight * (now.recovered - mean.recovered), now.recovered)
     powers, emitters = _powers(mean), []

@@ -69,9 +69,9 @@ def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArra
     both, but keeps their ratio.
 
     Args:
-        points: As for ``check_card``.
-        kind: As for ``check_card``.
-        light: As for ``check_card``.
+        points: Positions of the visible surface points, metres, (n, 3).
+        kind: ``Kind`` of each point's surface, (n,).
+        light: pi times the radiance of each point, (n, 3); the clipping level where it clips.
     """
     config = CONFIG.card
     paper, ink = np.flatnonzero(kind == Kind.CARD), np.flatnonzero(kind == Kind.INK)
@@ -108,7 +108,7 @@ def doubt_of(contrast: float) -> float:
 
 
 def irradiance_form(problem: Problem, normals: Array) -> Array:
-    """Return the matrix from radiance of cells to irradiance at the ball's place, (normals, cells)."""
+    """Return the matrix that maps the radiance of cells to irradiance at the ball's centre, (normals, cells)."""
     return np.asarray(np.maximum(normals @ problem.direction.T, 0.0) * problem.solid_angle)
 
 

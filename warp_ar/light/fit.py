@@ -98,7 +98,7 @@ class Fits:
     equations: Equations
     """Equations that were solved."""
     off: Array
-    """Residuals, left side minus right side, (fits, rows)."""
+    """Residuals, left side minus right side, of each equation, (fits, rows)."""
     weights: Array
     """Weights of the last quadratic problem, (fits, rows)."""
     hessian: Array
@@ -226,7 +226,7 @@ class Equations:
         return Fits(z, state.cost, self, state.off, weights, hessian)
 
     def _sum(self, z: Array) -> Array:
-        """Return the light of parts and candidates, (fits, rows)."""
+        """Return the irradiance from parts and candidates in each equation, (fits, rows)."""
         return np.asarray((self.light @ z[:, : self.mean_at, None])[..., 0], np.float64)
 
     def _at(self, z: Array) -> _State:
@@ -293,7 +293,7 @@ class Equations:
         return product
 
     def by_surface(self, values: Array) -> Array:
-        """Return the sums of rows' values over each surface that has rows, (fits, present, ...)."""
+        """Return the sum of the equations' values for each surface that has equations, (fits, surfaces, ...)."""
         return np.add.reduceat(values, self.starts, axis=1) if len(self.starts) else values
 
 

@@ -205,7 +205,7 @@ def _observe(
 
 
 def _meets(probe: Probe, points: Array, directions: Array) -> NDArray[np.bool_]:
-    """Return True for rays that pass near a ball."""
+    """Return a mask of the rays that pass near a ball; ray i starts at ``points[i]``."""
     to = np.asarray(probe.center) - points
     along = (to * directions).sum(1)
     return np.asarray((along > 0.0) & ((to**2).sum(1) - along**2 < (1.6 * probe.radius) ** 2))
@@ -251,7 +251,7 @@ def _mirror(wo: Array, roughness: float, seed: int) -> tuple[Array, Array]:
 
 
 def _masking(cosine: Array, alpha: float) -> Array:
-    """Return Smith's Lambda."""
+    """Return Smith's auxiliary function Lambda of GGX for the cosine of a direction's angle to the normal."""
     return np.asarray(0.5 * (np.sqrt(1.0 + alpha**2 * (1.0 / np.maximum(cosine, 1e-4) ** 2 - 1.0)) - 1.0))
 
 

@@ -276,12 +276,12 @@ class Problem:
 
     @property
     def first_mean(self) -> int:
-        """Index of the first component's mean."""
+        """Index of the first component's mean among the unknowns."""
         return self.parts + len(self.candidates)
 
     @property
     def first_surface(self) -> int:
-        """Place of the first surface's 1 / reflectance."""
+        """Index of the first surface's reciprocal reflectance among the unknowns."""
         return self.first_mean + self.components + 1
 
     def start(self, means: Array) -> Array:
@@ -309,7 +309,7 @@ class Problem:
         return columns
 
     def patch(self, cell: int) -> Array:
-        """Return the radiance of a candidate's unit power, distributed over cells around it that clip, (m, 3)."""
+        """Return factors of ``missing``, (m, 3), that give unit power to cells within ``search.angle`` of ``cell``."""
         near = (self.direction @ self.direction[cell] > np.cos(CONFIG.search.angle)) & self.may_hold_candidate
         near[cell] = True
         total = self.solid_angle[near] @ self.missing[near]
@@ -333,7 +333,7 @@ class Problem:
         self.candidates.append(candidate)
 
     def pop(self) -> None:
-        """Take the last candidate away."""
+        """Remove the candidate that was added last."""
         self.candidates.pop()
         self.candidate_columns = self.candidate_columns[:, :, :-1]
 

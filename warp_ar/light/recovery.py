@@ -98,8 +98,8 @@ class Recovery:
         If not, the given light is remembered as that of the next estimate.
 
         Args:
-            cells: As for ``update``.
-            observations: As for ``update``.
+            cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
+            observations: Records of ``Observation``, (n,).
         """
         return self._stillness.holds(cells, observations, settled=self._frames >= CONFIG.solver.settled)
 
@@ -237,7 +237,7 @@ class Recovery:
 
 
 def _by_card(problem: Problem) -> tuple[Array, tuple[bool, bool, bool], Array]:
-    """Return the results of ``card_means``, and the missing radiance of parts by the card alone, (parts, 3)."""
+    """Return the results of ``card_means``, and the missing radiance of parts from the card alone, (parts, 3)."""
     means, bounds = problem.card_means()
     return means, bounds, problem.expected[problem.component][:, None] * means
 

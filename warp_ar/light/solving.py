@@ -29,7 +29,7 @@ class Solver(Protocol):
     """Solver that can be pickled together with its arguments."""
 
     def update(self, *sides: Any) -> Any:
-        """Solve; the fifth argument traces emitters."""
+        """Solve one frame's equations; the fifth argument is the function that traces emitters."""
 
 
 class SolvingProcess:
@@ -99,7 +99,7 @@ class SolvingProcess:
     def _ask(
         self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None
     ) -> tuple[Any, Any] | None:
-        """Return the process's solver and solution; None if the process has died."""
+        """Let the process solve; return its updated solver and its solution, or None if the process has died."""
         with self._lock:
             try:
                 self._connection.send((solver, sides, trace is not None))
@@ -135,7 +135,7 @@ class SolvingProcess:
 
 
 def update(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> Any:
-    """Solve on this thread; arguments as for ``SolvingProcess.update``."""
+    """Solve on this thread; ``SolvingProcess.update`` describes the arguments."""
     cells, transfer, mirrored, observations, camera = sides
     return solver.update(cells, transfer, mirrored, observations, trace, camera)
 

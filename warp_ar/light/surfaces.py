@@ -179,7 +179,7 @@ def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
 def texture_overlap(
     positions: NDArray[Any], surface: NDArray[np.int64], kind: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Return the degree, 0 to 1, to which two points share their surface's texture, (n, n); 0 without texture.
+    """Return the degree, 0 to 1, to which the texture at two points is correlated, (n, n); 0 without texture.
 
     Args:
         positions: Positions of the points, metres, (n, 3).

@@ -676,7 +676,7 @@ class PoseSpec:
 
     @functools.cached_property
     def _places(self) -> dict[str, list[int]]:
-        """Map each picture's file name, with and without suffix, to the indices of its poses."""
+        """Indices of the poses by the file name of their picture, with and without suffix."""
         found: dict[str, list[int]] = {}
         for index, name in enumerate(map(PurePosixPath, self.names)):
             found.setdefault(f"/{name.name}", []).append(index)

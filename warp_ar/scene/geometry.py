@@ -229,7 +229,7 @@ def creased_normals(
 
 
 def _joined(count: int, first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the smallest member of each item's group, (count,); the pairs ``first``, ``second`` share a group."""
+    """Return the smallest item of each item's group, (count,); items ``first[k]`` and ``second[k]`` share a group."""
     label = np.arange(count)
     while True:
         lowest = np.minimum(label[first], label[second])

@@ -36,7 +36,7 @@ class GltfFile:
             source: The file.
 
         Raises:
-            SceneError: The file is incomplete, too large, or violates glTF. All methods raise it likewise.
+            SceneError: The file is incomplete, too large, or violates glTF. All methods raise it for these reasons.
         """
         self.source = source
         path, data = source.path, source.data
@@ -101,7 +101,7 @@ class GltfFile:
         return [self.index(entry, count, what) for entry in value or []]
 
     def whole(self, item: dict[str, Any], key: str, label: str) -> int:
-        """Return a whole number that is not negative; 0 if the key is missing."""
+        """Return ``item[key]``, checked to be a whole number of at least 0; 0 if the key is missing."""
         value = item.get(key, 0)
         if isinstance(value, bool) or not isinstance(value, int) or value < 0:
             self.fail(f"{label} has {key} {str(value)[:20]!r}, no whole number from 0 on")
@@ -110,7 +110,10 @@ class GltfFile:
     def number(
         self, item: dict[str, Any], key: str, default: float, high: float, label: str, *, low: float = 0.0
     ) -> float:
-        """Return a number, clamped to its range."""
+        """Return ``item[key]``, or ``default`` if the key is missing, clamped to [``low``, ``high``].
+
+        ``label`` names the item in errors.
+        """
         value = item.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             self.fail(f"{label} has {key} {str(value)[:30]!r}, which is no finite number")
@@ -121,7 +124,10 @@ class GltfFile:
     def numbers(
         self, item: dict[str, Any], key: str, default: tuple[float, ...], high: float, label: str, *, low: float = 0.0
     ) -> tuple[float, ...]:
-        """Return as many numbers as ``default`` has, each clamped to its range."""
+        """Return the list ``item[key]``, as long as ``default``, with each number clamped to [``low``, ``high``].
+
+        A missing key gives ``default``. ``label`` names the item in errors.
+        """
         value = item.get(key, default)
         if not isinstance(value, list | tuple) or len(value) != len(default):
             self.fail(f"{label} has {key} {str(value)[:30]!r}; a list of {len(default)} numbers is right")
@@ -232,7 +238,7 @@ class GltfFile:
         return values
 
     def _overlay(self, values: npt.NDArray[Any], sparse: dict[str, Any], label: str) -> npt.NDArray[Any]:
-        """Return the elements with those of a sparse accessor replaced."""
+        """Return a copy of ``values`` in which the elements listed by a sparse accessor are replaced."""
         label = f"the sparse part of {label}"
         where, other = self.table(sparse, "indices", label), self.table(sparse, "values", label)
         count, kind = self.whole(sparse, "count", label), where.get("componentType")

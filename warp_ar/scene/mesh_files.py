@@ -61,7 +61,7 @@ def referenced_files(path: Path) -> dict[str, bytes]:
     """Return the contents of the files that a mesh file refers to (materials, buffers, textures), by their names in it.
 
     Raises:
-        SceneError: As :func:`load_mesh`.
+        SceneError: A file is missing, damaged or of another format.
     """
     return _load(path)[1].known
 
@@ -74,7 +74,7 @@ def load_moving_mesh(path: Path, animation: str | int) -> MovingMesh:
         animation: Name of the animation, or its number from 0 on.
 
     Raises:
-        SceneError: As :func:`load_mesh`; or there is no such animation, or it is damaged.
+        SceneError: The file is missing or damaged, or it has no such animation.
     """
     contents, source = _read_file(path, animation)
     with _said_in_words(path):
@@ -85,7 +85,7 @@ def animations_of(path: Path) -> list[str]:
     """Return the names of a glTF file's animations in file order; an unnamed animation has an empty name.
 
     Raises:
-        SceneError: As :func:`load_mesh`.
+        SceneError: The file is missing or damaged.
     """
     data = read_bytes(path, "mesh_bytes", SceneError)
     with _said_in_words(path):
@@ -101,7 +101,7 @@ def _load(path: Path) -> tuple[Mesh, MeshSource]:
 
 @contextlib.contextmanager
 def _said_in_words(path: Path) -> Iterator[None]:
-    """Turn errors that readers raise on damaged files into a SceneError."""
+    """Convert errors that readers raise on damaged files into a SceneError."""
     try:
         yield
     except SceneError:

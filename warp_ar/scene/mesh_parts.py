@@ -59,13 +59,13 @@ class MeshPart:
 
         Args:
             label: The file, for messages.
-            vertices: (n, 3).
-            faces: (m, 3).
-            normals: (n, 3) of any length; invalid normals, or all if None, are computed.
-            uvs: Of (n, 2), as ``uvs``; a set that is not finite is left out.
-            colors: As ``colors``.
-            tangents: As ``tangents``; left out where they are not finite.
-            material: As ``material``.
+            vertices: Positions, (n, 3).
+            faces: Vertex indices, (m, 3).
+            normals: Normals of any length, (n, 3); invalid normals, or all if None, are computed.
+            uvs: Two sets of texture coordinates, (n, 2), v up; a set that is not finite is left out.
+            colors: Linear RGBA, (n, 4).
+            tangents: In the form of ``Mesh.tangents``, (n, 4); left out if any is not finite.
+            material: Material; None if the file gives none.
             crease: Angle in degrees above which edges are sharp in computed normals; None: all edges are smooth.
 
         Raises:
@@ -171,7 +171,7 @@ def check_indices(label: str, index: npt.NDArray[np.int64], count: int) -> None:
 
 
 def strip_triangles(indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return the triangles, (m, 3), of strips separated by negative indices, with a strip's own winding."""
+    """Return the triangles, (m, 3), of strips that negative indices separate; all have their strip's orientation."""
     place = np.arange(len(indices))
     start = np.maximum.accumulate(np.where(indices < 0, place + 1, 0))
     odd = ((place - start) % 2 == 1)[:-2]
@@ -260,7 +260,7 @@ def _finite(values: Any, count: int, largest: float) -> Array | None:
 
 
 def unit_or(vectors: Array, other: Array) -> Array:
-    """Return vectors (n, 3) normalized; a vector without direction is replaced by that of ``other``."""
+    """Return ``vectors``, (n, 3), normalized; a vector of length 0 is replaced by the one in ``other``."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     usable = np.isfinite(length) & (length > 0.0)
     return np.where(usable, vectors / np.where(usable, length, 1.0), other)

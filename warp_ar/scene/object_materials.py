@@ -137,7 +137,7 @@ def stretched_mesh(mesh: Mesh, stretch: tuple[float, ...]) -> Mesh:
 
 
 def moving_mesh_of(item: Object) -> MovingMesh | None:
-    """Return the animation that an object plays, cached as by ``file_mesh``; None if it plays none.
+    """Return the animation that an object plays, cached until the file changes; None if it plays none.
 
     Raises:
         SceneError: Its file has no such animation, or cannot be read.

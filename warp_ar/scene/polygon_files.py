@@ -238,7 +238,7 @@ def linear_rgba(values: Array, largest: float) -> Array:
 
 
 def _shown_colors(source: MeshSource, values: Array, largest: float) -> Array:
-    """Return linear RGBA as `linear_rgba`, but opaque if alpha is 0 everywhere, as programs without alpha write it."""
+    """Return linear RGBA of sRGB-encoded colours; opaque if alpha is 0 everywhere, as programs without alpha write."""
     colors = linear_rgba(values, largest)
     if len(colors) and not colors[:, 3].any():
         source.note("alpha of colours, which is 0 everywhere")

@@ -312,7 +312,10 @@ class HostScene:
     def write_proxies(
         self, records_out: npt.NDArray[Any], places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
-        """Write the records of proxies at the places of their markers; arguments and value as in ``write_objects``."""
+        """Write the records of proxies at the places of their markers.
+
+        ``write_objects`` describes the arguments and the result.
+        """
         for record, fixed, item in zip(self._proxies, self._fixed_proxies, self.scene.proxies, strict=True):
             if item.marker is not None:
                 _place(record, item, fixed["rotation"], fixed["position"], places)
@@ -328,7 +331,7 @@ class HostScene:
 
         Args:
             pose: ``camera_from_world``.
-            places: As in ``write_objects``.
+            places: ``world_from_marker`` of every marker that moves a ball; None for a lost marker.
         """
         if all(probe.marker is None for probe in self.scene.probes):
             return False
@@ -349,7 +352,7 @@ class HostScene:
     def write_lights(
         self, records_out: npt.NDArray[Any], seconds: float, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
-        """Write the virtual lights' records for a time; arguments and value as in ``write_objects``."""
+        """Write the virtual lights' records for a time; ``write_objects`` describes the arguments and the result."""
         for record, light in zip(self._lights, self.scene.lights, strict=True):
             if light.animate is None and light.marker is None and seconds != 0.0 and not self._lights_edited:
                 continue

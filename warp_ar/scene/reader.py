@@ -192,7 +192,7 @@ def loads_scene(text: str, path: str | Path | None = None, files: SceneFiles | N
         files: Files that the scene may refer to, if it is untrusted, and the folder where relative paths start.
 
     Raises:
-        SceneError: As :func:`load_scene`.
+        SceneError: The scene is invalid; one line names file, key, value and allowed values.
     """
     path = None if path is None else Path(path)
     label = "scene" if path is None else str(path)
