@@ -36,7 +36,7 @@ LEAST_POINTS = wp.constant(wp.int32(8))
 AGREEING = wp.constant(wp.float32(0.7))
 """Least share of the card's points whose ratio of radiance agrees with the median."""
 SPREAD = wp.constant(wp.float32(0.1))
-"""Largest relative difference of a ratio that agrees with the median."""
+"""Largest relative difference from the median at which a ratio agrees with it."""
 MOST = wp.constant(wp.float32(1.5))
 """Highest level; a larger rise of the card is probably another lamp."""
 DARK = wp.constant(wp.float32(0.0016))
@@ -70,7 +70,7 @@ def add_rows_kernel(
     # Out:
     upward_out: wp.array[wp.float32],
 ):
-    """Sum all rows, in their order."""
+    """Sum the irradiance of all rows, from the first to the last."""
     c = wp.tid()
     total = wp.float32(0.0)
     for i in range(rows.shape[0]):
@@ -92,7 +92,7 @@ def sum_upward(radiance: wp.array, rows: wp.array, upward_out: wp.array) -> None
 
 @wp.func
 def change_of(now: Observation, then: Observation, c: wp.int32) -> wp.float32:
-    """Return the ratio of a point's radiance now and then, in a channel; negative where either is unknown."""
+    """Return a point's radiance now over that in the estimate's frame, in channel c; negative if either is unknown."""
     seen = wp.min(now.visible, then.visible) > 0.8 and wp.max(now.clipped[c], then.clipped[c]) < 0.01
     if seen and now.radiance[c] > DARK and then.radiance[c] > DARK:
         return now.radiance[c] / then.radiance[c]
@@ -110,7 +110,7 @@ def follow_level_kernel(
     # Out:
     level_out: wp.array[wp.float32],
 ):
-    """Write the level of one channel, by the thread of the point whose ratio is the median."""
+    """Write the level of one channel; only the thread of the point with the median ratio writes."""
     c, own = wp.tid()
     change = change_of(now[own], then[own], c)
     unseen = share[c]

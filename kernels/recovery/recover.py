@@ -31,7 +31,7 @@ wp.set_module_options({"enable_backward": False})
 PATCH = wp.constant(5)
 """Points along the side of the square patch over which a surface point's radiance is averaged."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
-"""Factor on a ball's radius for hiding surfaces, because its outline is blurred."""
+"""Factor on a ball's radius in tests of what it hides, because its outline in the frame is blurred."""
 FAR_FROM_BALL = wp.constant(wp.float32(10.0))
 """Distance in radii beyond which light reflected by a ball is ignored: (R / 2 s)^2, less than 1/400 of the light
 itself."""
@@ -63,7 +63,7 @@ class Observation:
 
 @wp.func
 def surface_error(scene: RayScene, point: SurfacePoint) -> wp.float32:
-    """Return a bound on a point's distance from its surface by rounding, metres; the largest proxy's for all."""
+    """Return a bound, metres, on a point's distance from its surface by rounding, for the largest proxy."""
     size = wp.float32(0.0)
     for index in range(scene.proxies.shape[0]):
         size = wp.max(size, scene.proxies[index].scale * wp.length(scene.proxies[index].extent))
@@ -72,7 +72,7 @@ def surface_error(scene: RayScene, point: SurfacePoint) -> wp.float32:
 
 @wp.func
 def distance_to_sphere(center: wp.vec3, radius: wp.float32, origin: wp.vec3, direction: wp.vec3) -> wp.float32:
-    """Return the distance along a unit direction to a sphere that the ray meets from outside; negative for none."""
+    """Return the distance, metres, at which a ray of unit direction enters a sphere; negative if it does not."""
     to_center = center - origin
     along = wp.dot(to_center, direction)
     off = to_center - along * direction

@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False})
 CELL_ROWS = wp.constant(32)
 CELL_COLUMNS = 64
 FULL_TRUST = wp.constant(wp.float32(0.5))
-"""Confidence above which a texel counts as observed; as for filling."""
+"""Confidence above which a texel counts as observed."""
 LOST = 0.02
 """Clipped share from which on a cell belongs to a clipped region, and its missing light is that of clipped texels."""
 _LOST = wp.constant(wp.float32(LOST))
@@ -38,7 +38,7 @@ class Cell:
 
     radiance: wp.vec3  # mean, as captured
     clipped: wp.vec3  # mean share that may lack light: clipped, or, in a cell that shows no light, not observed
-    missing: wp.vec3  # the same, with less weight on saturation boundaries
+    missing: wp.vec3  # ``clipped`` with less weight on saturation boundaries
     hidden: wp.float32  # mean share that is not observed; 0 in a cell that shows some light
     modelled: wp.float32  # 1 if the first ball sees a proxy in this direction, 0 if the environment beyond
     middle: wp.vec3  # unit, direction of the cell's centre
@@ -73,7 +73,7 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         # Out:
         missing_out: wp.array2d[wp.vec3],
     ):
-        """Correct the texels of one cell."""
+        """Write 0 for the texels of one cell that are left out."""
         band_row, column = wp.tid()
         row = row_start + band_row
         height = clipped.shape[0]
@@ -95,7 +95,7 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                             on += area
                         else:
                             missing_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
-            # A second pass if texels on proxies and beyond clip, and enough of them beyond.
+            # A second pass, if texels clip both on proxies and beyond them, and enough of them lie beyond.
             turn += 1
             if not (on > 0.0 and beyond > BEYOND * (on + beyond)):
                 turn = wp.int32(2)

@@ -35,7 +35,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 NEARBY = wp.constant(wp.float32(0.2))
-"""Distance of unit directions below which weights of cells are nearly equal: those of one lamp and its neighbours."""
+"""Distance of unit directions below which weights of cells are nearly equal: about the size of one lamp's image."""
 
 
 @wp.func
@@ -76,7 +76,7 @@ def relocate_kernel(
 
 @wp.func
 def kinship(a: wp.vec3, b: wp.vec3) -> wp.float32:
-    """Return the weight w of a unit direction for another."""
+    """Return the weight w, by which energy from the direction ``a`` is given to the direction ``b``, both unit."""
     away = a - b
     near = wp.dot(away, away) + NEARBY * NEARBY
     return 1.0 / (near * near)
@@ -93,7 +93,7 @@ def send_recovered_kernel(
     # Out:
     sent_out: wp.array2d[wp.vec3],
 ):
-    """Write a cell's energy e over its sum of weights; -1 if the energy keeps its direction."""
+    """Write a cell's recovered energy over the sum of its weights, or -1 if the energy keeps its direction."""
     i, j = wp.tid()
     i += row_start
     cell = cells[i, j]
@@ -166,7 +166,7 @@ def move_emitters_kernel(
     # Out:
     emitters_out: wp.array[Emitter],
 ):
-    """Move one emitter."""
+    """Write one emitter with its direction and distance from another ball."""
     k = wp.tid()
     place = places[ball]
     emitters_out[k] = seen_from(emitters[k], wp.vec3(place[0], place[1], place[2]))
@@ -208,7 +208,7 @@ Args:
     environment: (h, w) map of the first ball, with recovered light.
     captured: (h, w) map of the first ball, without recovered light.
     emitters: Emitters of the first ball's map; None if the method finds no positions.
-    cells: (rows, columns) as for ``send_recovered``.
+    cells: (rows, columns) ``Cell`` of the first ball's map, of the frame from which light was recovered.
     sent: (rows, columns) from ``send_recovered``.
     environment_out: (h, w) ``wp.vec3``, map of the other ball with recovered light.
 """

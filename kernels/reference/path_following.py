@@ -279,7 +279,7 @@ def extend_path(
     without_near: wp.bool,
     key: PathKey,
 ) -> PathState:
-    """Put a path on its next ray, drawn with ``density`` (NO_DENSITY for a mirror); its throughput is 0 if it ends."""
+    """Return the path on its next ray, drawn with ``density`` (NO_DENSITY: a mirror); throughput 0 ends the path."""
     following = path
     share = wp.vec3(0.0, 0.0, 0.0)
     if density > 0.0:
@@ -302,7 +302,7 @@ def extend_path(
 
 @wp.func
 def bring(pair: PathPair, radiance: wp.vec3) -> PathPair:
-    """Add radiance at the end of the followed path, times its throughput, to the result."""
+    """Add the radiance found by the followed path, times its throughput, to the pair's result."""
     out = pair
     if pair.path.without:
         out.physical += wp.cw_mul(pair.path.throughput, radiance)
@@ -313,7 +313,7 @@ def bring(pair: PathPair, radiance: wp.vec3) -> PathPair:
 
 @wp.func
 def begin_without(pair: PathPair) -> PathPair:
-    """Let the path wait, and start a side path without virtual content on the same ray."""
+    """Store the main path as waiting, and start a side path without virtual content on the same ray."""
     out = pair
     out.waiting = pair.path
     out.physical = wp.vec3(0.0, 0.0, 0.0)

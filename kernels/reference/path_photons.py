@@ -92,7 +92,7 @@ MOST = wp.constant(wp.float32(8192.0))
 LEAST_VERSINE = wp.constant(wp.float32(1.0e-6))
 """Least versine of the cone toward an object: a half angle of 0.08 degrees."""
 COUNTERS = 1024
-"""Sums of rays."""
+"""Number of counters over which the count of rays is spread."""
 
 
 @wp.struct
@@ -387,7 +387,7 @@ def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
 
 
 def make_light_image(shape: tuple[int, int], device: wp.DeviceLike) -> LightImage:
-    """Return the sums of no paths, for a picture of (H, W) pixels."""
+    """Return a ``LightImage`` of zeros for a picture of (H, W) pixels."""
     image = LightImage()
     size = 3 * shape[0] * shape[1]
     image.sums, image.squares = (wp.zeros(size, dtype=wp.int64, device=device) for _ in range(2))

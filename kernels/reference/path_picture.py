@@ -29,7 +29,7 @@ from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 wp.set_module_options({"enable_backward": False})
 
 SMOOTHED = wp.constant(2)
-"""Pixels to each side over which irradiance is averaged for the map of reflectance."""
+"""Half width, pixels, of the window over which irradiance is averaged for the map of reflectance."""
 
 
 @wp.struct
@@ -98,7 +98,7 @@ class Round:
 # of the pixel, 0 to 1. So the count does not depend on how passes are grouped, and pixels of small shares alternate.
 @wp.func
 def samples_after(passes: wp.int32, share: wp.float32, bits: wp.uint32) -> wp.int32:
-    """Return the number of samples of a pixel after so many passes."""
+    """Return the number of samples that a pixel has after ``passes`` passes; ``bits`` give its random number u."""
     return wp.int32(wp.floor(wp.float32(passes) * share + uniform_from_bits(bits)))
 
 
@@ -359,7 +359,7 @@ def finish_picture_kernel(
 
 
 def make_moments(shape: tuple[int, int], device: wp.DeviceLike) -> Moments:
-    """Return moments of no samples, for (H, W) pixels."""
+    """Return ``Moments`` of zeros, for (H, W) pixels."""
     moments = Moments()
     for name in Moments.vars:
         dtype = {"proxies": wp.float32, "rays": wp.int32, "samples": wp.int32}.get(name, wp.vec3)

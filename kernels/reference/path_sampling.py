@@ -61,7 +61,7 @@ PI = wp.constant(wp.float32(math.pi))
 ALL_MODELS = tuple(sorted(map(int, (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR))))
 """All models of materials."""
 NO_DENSITY = wp.constant(wp.float32(-1.0))
-"""Marker in place of a density for directions without one: of a mirror or the camera."""
+"""Value in place of the density of a direction that is not sampled: a mirror's or a camera's ray."""
 LEAST_CHANCE = wp.constant(wp.float32(0.1))
 """Least probability of sampling either lobe of a surface with two; a weak lobe can carry all visible light."""
 EVEN_SHARE = 0.01
@@ -171,7 +171,7 @@ def texel_of(direction: wp.vec3, height: wp.int32, width: wp.int32) -> wp.vec2i:
 
 @wp.func
 def draw_sky(sky: Sky, origin: wp.vec3, u: wp.vec2, v: wp.float32) -> SkyLight:
-    """Draw light of the environment at ``origin``, occlusion ignored; ``v`` decides whether of a near emitter."""
+    """Draw light of the environment at ``origin``, occlusion ignored; of near emitters if ``v`` < ``near_share``."""
     height = sky.radiance.shape[0]
     width = sky.radiance.shape[1]
     light = SkyLight()
@@ -308,7 +308,7 @@ def disk_density(light: Light, distance: wp.float32, cosine: wp.float32) -> wp.f
 
 @wp.func
 def draw_on_light(light: Light, sample: LightSample, u: wp.vec2) -> wp.vec4:
-    """Return the unit direction toward a random point of a light, and its distance; of its centre if it has no disk."""
+    """Return (x, y, z, distance): unit direction and distance of a random point of a light's disk, or of its centre."""
     if not has_penumbra(light, sample):
         return wp.vec4(sample.wi[0], sample.wi[1], sample.wi[2], sample.distance)
     disk = light.radius * sample_disk(u)
@@ -413,7 +413,7 @@ def make_sky(radiance: np.ndarray, device: wp.DeviceLike, emitters: np.ndarray |
     """Return the environment with its sampling tables, on a device.
 
     Args:
-        radiance: As for ``sky_tables``.
+        radiance: Latlong (H, W, 3), linear.
         device: Device of the arrays.
         emitters: Records of ``structs.Emitter``; distant ones remain part of the environment.
     """

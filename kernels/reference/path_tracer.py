@@ -39,7 +39,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 WHOLE, DIFFERENCE, IRRADIANCE = 0, 1, 2
-"""Task of the tracer: radiance of the scene; change of the frame by virtual content; or only reflectance."""
+"""Tasks of the tracer: radiance of the scene; change of the frame by virtual content; irradiance for reflectance."""
 
 
 @wp.func

@@ -82,7 +82,7 @@ class Seen:
 
 @wp.func
 def from_viewer(vertex: Vertex, wo: wp.vec3) -> Vertex:
-    """Turn the normals of a vertex toward the viewer; the shading normal keeps a least cosine."""
+    """Return a vertex whose normals face the viewer; the shading normal has at least a small positive cosine."""
     result = vertex
     normal, geometric = face_viewer(vertex.hit.normal, vertex.hit.geometric_normal, wo)
     result.hit.normal = normal
@@ -92,7 +92,7 @@ def from_viewer(vertex: Vertex, wo: wp.vec3) -> Vertex:
 
 @functools.cache
 def make_find_vertex(trace: TraceConfig) -> wp.Function:
-    """``find_vertex(scene, origin, direction, objects) -> Vertex``: first surface; if ``objects``, virtual ones too."""
+    """``find_vertex(scene, origin, direction, objects) -> Vertex``: first surface, also of objects if ``objects``."""
     functions = make_trace(trace)
     closest_object, closest_proxy = functions.closest_object, functions.closest_proxy
 
