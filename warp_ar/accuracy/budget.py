@@ -73,9 +73,9 @@ class AutoPipeline(Closing):
             device: ``auto``, ``cpu`` or ``cuda:N``.
             size: Width and height of the frames; None means the scene's.
             outputs: Parts of the results, as for ``Pipeline``.
-            exposures: As for ``Pipeline``.
-            shown: As for ``Pipeline``.
-            estimates: As for ``Pipeline``.
+            exposures: Exposure times in seconds between which the frames alternate.
+            shown: Exposure time in seconds of the frames that are shown; None means the longest.
+            estimates: Frame in which an estimate takes effect: ``synchronous``, ``delayed`` or ``real_time``.
             costs: Known costs; None: they are read from the cache or measured.
             folder: Folder in which costs are kept; None means the user's cache folder.
             clock: Clock in seconds.

@@ -98,7 +98,7 @@ def _reach(item: Object) -> float:
 
 
 def _side(ball: Probe, pose: Pose, camera: Camera) -> str:
-    """Return the side of the picture beyond which a ball lies."""
+    """Return a phrase for the place of a ball outside the picture, such as "left of the picture"."""
     x, y, z = map(float, pose.apply(np.array(ball.center)))
     if z <= 0.0:
         return "behind the camera"
