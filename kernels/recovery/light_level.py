@@ -37,8 +37,9 @@ AGREEING = wp.constant(wp.float32(0.7))
 """Least share of the card's points whose ratio of radiance agrees with the median."""
 SPREAD = wp.constant(wp.float32(0.1))
 """Largest relative difference from the median at which a ratio agrees with it."""
-MOST = wp.constant(wp.float32(1.5))
-"""Highest level; a larger rise of the card is probably another lamp."""
+MOST = wp.constant(wp.float32(2.5))
+"""Highest level: a lamp comes back that was dimmed to 40 % in the estimate's frame. A larger rise is probably another
+lamp."""
 DARK = wp.constant(wp.float32(0.0016))
 """Radiance below which a point is not used, because of quantisation."""
 
