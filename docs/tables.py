@@ -148,23 +148,20 @@ def desk_ladder() -> str:
 
 
 def methods() -> str:
-    """Return every method: its presets, error and, where measured, milliseconds above the cheapest of its stage."""
+    """Return every method: its presets and its error."""
     from warp_ar.accuracy.cost_table import SETTINGS, WORDS, chosen
     from warp_ar.stages.quality import PRESETS
 
     known = figures()[0]["errors"]
-    devices = [one for one in figures() if "milliseconds" in one]
-    rows = [["method", "meaning", "presets", "error", *(f"ms more, {one['made']['device']}" for one in devices)]]
-    rows.append(["---", "---", "---", *["--:"] * (len(rows[0]) - 3)])
+    rows = [["method", "meaning", "presets", "error"], ["---", "---", "---", "--:"]]
     for setting in SETTINGS:
         errors = known.get(setting.name, {})
         what, words = WORDS.get(setting.name, ("", {}))
-        rows.append([f"**{setting.name.replace('_', ' ')}**", what, *[""] * (len(rows[0]) - 2)])
+        rows.append([f"**{setting.name.replace('_', ' ')}**", what, "", ""])
         for method in [method for method in setting.methods if method in errors]:
-            times = [one["milliseconds"].get(setting.name, {}).get(method) for one in devices]
             names = [name for name, quality in PRESETS.items() if chosen(quality, setting) == method]
             own = f"from {names[0]}" if len(names) > 2 and names == list(PRESETS)[-len(names) :] else ", ".join(names)
-            rows.append([f"`{method}`", words.get(method, ""), own, f"{errors[method]:.4f}", *map(milliseconds, times)])
+            rows.append([f"`{method}`", words.get(method, ""), own, f"{errors[method]:.4f}"])
     return "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
 
 
@@ -173,8 +170,7 @@ def measured() -> str:
     lines = []
     for one in figures():
         made = one["made"]
-        presets = f"; presets with milliseconds at commit {made['presets']}" if "presets" in made else ""
-        lines.append(f"- {made['device']}, commit {made['commit']}{presets}, Warp {made['warp']}")
+        lines.append(f"- {made['device']}, commit {made['commit']}, Warp {made['warp']}")
     return "\n".join(lines)
 
 
