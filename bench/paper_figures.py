@@ -521,5 +521,5 @@ def _reading_error(context: Context, case: Case, reading: Reading) -> float:
     if reading.video:
         camera = dataclasses.replace(case.scene.camera, transfer="linear")
         read = dataclasses.replace(case, scene=dataclasses.replace(case.scene, camera=camera))
-    images = run(read, quality, context.device)
+    images = run(read, {"": quality}, context.device)[""]
     return picture_error(case, case.truth, images)
