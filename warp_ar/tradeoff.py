@@ -62,7 +62,7 @@ def make_parser() -> argparse.ArgumentParser:
         help=f"most frames of a clip (default: {DEFAULT_FRAMES})",
     )
     parser.add_common("--shrink", "--device")
-    add("--quick", action="store_true", help="without brute force: minutes instead of hours")
+    add("--quick", action="store_true", help="without brute force, in less time")
     add("--processor-time", action="store_true", help="on CPU measure all threads' processor time, not clock time")
     text = "folder of tradeoff.jsonl, cost_table.json, tradeoff.html (or presets.json)"
     add("--out", type=Path, metavar="DIR", help=text)

@@ -23,7 +23,7 @@ from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, load_prese
 from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_steps, read_costs, write_costs
 from warp_ar.cache_folder import cache_folder
 from warp_ar.engine.graph import make_plan
-from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.pipeline import TRACK, Pipeline
 from warp_ar.scene import Pose
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, PRESETS, Quality
 from warp_ar.viewer.protocol import Notify, begin, failure
@@ -151,36 +151,39 @@ class BudgetSetting:
             controller.observe(milliseconds, now)
         return dataclasses.replace(turn(BASE, controller.settings), name=AUTO)
 
-    def observe(self, preset: str, milliseconds: float | None) -> Quality | None:
+    def observe(self, preset: str, milliseconds: float | None, tracking: float) -> Quality | None:
         """Record the time of a frame and return the quality for the next frames, as ``choose`` does.
 
         Args:
             preset: Name of the quality that lit the frame.
             milliseconds: Time of the frame; None if that quality did not light all of it.
+            tracking: Milliseconds of the frame in which the marker was tracked.
         """
         self._since_restart += 1
         if self.measuring:
             milliseconds = None
-        self.note(preset, milliseconds if self._since_restart > _SETTLED else None)
+        if milliseconds is not None and self._since_restart > _SETTLED:
+            self.note(preset, milliseconds)
+            self.note(TRACK, tracking)
         return self.choose(milliseconds, time.monotonic())
 
-    def note(self, preset: str, milliseconds: float | None) -> None:
-        """Record the time of a frame under a preset's name; None is ignored."""
-        if milliseconds is not None:
-            self._preset_ms.setdefault(preset, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
+    def note(self, name: str, milliseconds: float) -> None:
+        """Record the time of a frame under a preset's name, or that of its tracking under ``TRACK``."""
+        self._preset_ms.setdefault(name, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
 
     def costs(self) -> dict[str, dict[str, Any]]:
         """Return each preset's milliseconds per frame and the number of measured frames.
 
         A preset that has run gets the median of its frames; the base otherwise gets its measured cost. Others get the
-        cost table's value, scaled by the mean ratio of measured to tabulated times. A preset that has not run and
-        is not in the table is left out. Callable from any thread.
+        cost table's value, scaled by the mean ratio of measured to tabulated times, and the time of tracking, which the
+        table leaves out. A preset that has not run and is not in the table is left out. Callable from any thread.
         """
         offer = self._offer  # read once, as measuring sets it
         ran = {BASE.name: (offer["base"], 0)} if offer else {}
         ran |= {name: (statistics.median(ms), len(ms)) for name, ms in list(self._preset_ms.items()) if ms}
-        ratios = [ran[name][0] / ms for name, ms in self._table.items() if name in ran] or [1.0]
-        scaled = {name: (ms * statistics.mean(ratios), 0) for name, ms in self._table.items()}
+        tracking, _ = ran.pop(TRACK, (0.0, 0))
+        ratios = [(ran[name][0] - tracking) / ms for name, ms in self._table.items() if name in ran] or [1.0]
+        scaled = {name: (ms * statistics.mean(ratios) + tracking, 0) for name, ms in self._table.items()}
         return {name: {"ms": round(ms, 2), "frames": count} for name, (ms, count) in (scaled | ran).items()}
 
     def forget_costs(self, preset: str | None = None) -> None:
@@ -194,16 +197,11 @@ class BudgetSetting:
         if self._controller is not None:
             self._controller.restart()
 
-    def state(self) -> dict[str, Any] | None:
-        """Return the chosen methods with expected time and error; None while none are chosen. From any thread."""
+    @property
+    def load(self) -> float | None:
+        """Ratio of measured to expected frame times; None while no methods are chosen. From any thread."""
         controller = self._controller
-        if controller is None or self.budget is None:
-            return None
-        return {
-            "settings": dict(controller.settings),
-            "expected_error": self._whole_error(controller.expected_error),
-            "factor": round(controller.factor, 4),
-        }
+        return None if controller is None or self.budget is None else round(controller.factor, 4)
 
     def record(self) -> dict[str, Any]:
         """Return all choices of methods as a message for the page. From any thread."""

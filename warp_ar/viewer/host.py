@@ -17,7 +17,7 @@ import numpy as np
 
 from warp_ar.checks.pointed_shape import point_out
 from warp_ar.device import exclusive
-from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
+from warp_ar.engine.pipeline import TRACK, Pipeline, Result, resolve_quality
 from warp_ar.errors import SourceError, UsageError, WarpArError
 from warp_ar.scene import Camera, Pose, Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.scene.object_shapes import object_shapes
@@ -367,7 +367,7 @@ class Host:
             "compare_ready": lighting.compare_ready or self.convergence.status is not None,
             "convergence": self.convergence.status,
             "budget": budget.budget,
-            "auto": budget.state(),
+            "load": budget.load,
             "costs": budget.costs(),
             "watchers": controls.watchers,
         }
@@ -678,7 +678,8 @@ class Host:
         # Times of held frames, and of a pipeline that is about to be replaced, are not representative.
         steady = not self._lighting.changing and controls.playing and pipeline.quality == wanted.shown_quality()
         budget.look(pipeline, frame.image, result.pose, self._lighting.builder)
-        chosen = budget.observe(wanted.quality.name, light_ms if steady else None)
+        tracking = result.stages[TRACK].milliseconds if TRACK in result.stages else 0.0
+        chosen = budget.observe(wanted.quality.name, light_ms if steady else None, tracking)
         if chosen is not None and chosen != wanted.quality:
             budget.forget_costs(chosen.name)
             controls.change(lambda w: dataclasses.replace(w, quality=chosen) if w.quality.name == AUTO else w)

@@ -538,8 +538,8 @@ export class QualityPanel {
 
   /** Times here over those that methods were measured to take, from the base, which is medium. */
   get #load() {
-    const { costs = {}, auto } = this.#state ?? {};
-    return auto?.factor ?? (costs.medium ? costs.medium.ms / this.#budget.base : 1);
+    const { costs = {}, load } = this.#state ?? {};
+    return load ?? (costs.medium ? costs.medium.ms / this.#budget.base : 1);
   }
 
   /** What the slider's budget buys, as the program chooses; null while no costs are known. */
