@@ -1,7 +1,7 @@
 """Camera opened through OpenCV, optionally with alternating exposures.
 
-Devices apply a new exposure time several frames late. The brightness of each picture is therefore measured to find out
-which exposure it was taken with.
+Devices apply a new exposure time several frames late. The exposure of each picture is therefore found from its
+brightness.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_exposures, che
 Image = npt.NDArray[np.uint8]
 
 BRACKET_SECONDS = 0.4
-"""Seconds between requests for other exposures; meanwhile the displayed picture is not updated."""
+"""Seconds for which the longest exposure is used between two rounds of the others. The displayed picture stands still
+during a round."""
 
 SETTLE_FRAMES = 5
-"""Number of frames after which a device is expected to use its first exposure."""
+"""Number of frames after which a device is assumed to use its first exposure."""
 
 MOST_WAIT = 12
 """Number of frames within which a device must use a newly requested exposure."""
@@ -35,18 +36,18 @@ CLOSE_SECONDS = 3.0
 """Longest time in seconds that closing waits for a picture being read, because a driver may hang."""
 
 MOST_MISSES = 3
-"""Number of consecutive exposure changes that a device may fail to follow."""
+"""Number of consecutive failed changes of the exposure after which the source gives up."""
 
 LEAST_RATIO = 1.8
 """Smallest ratio of neighbouring exposures; closer exposures cannot be distinguished by brightness."""
 
 
 class _Bracketing:
-    """Requests one exposure after another from a device, and finds the exposure of each picture.
+    """Exposure control of a device: requests one exposure after another and finds that of each picture.
 
-    A device takes some frames to change its exposure. The present exposure is found by comparison with the last picture
-    of the longest exposure: over pixels that are well exposed there, the ratio of linear values is the ratio of
-    exposure times.
+    A device takes some frames to change its exposure. Each picture is therefore compared with the last picture of the
+    longest exposure. Over the pixels that are well exposed in that picture, the ratio of linear values equals the ratio
+    of exposure times.
     """
 
     def __init__(self, capture: Any, exposures: tuple[float, ...], name: str) -> None:
@@ -99,7 +100,16 @@ class _Bracketing:
         return seconds
 
     def _give_up(self, now: float) -> None:
-        """Start again with the longest exposure, because the device is late or the environment has changed."""
+        """Start again with the longest exposure after a change that was not seen in the pictures.
+
+        Either the device does not change its exposure, or the brightness of the environment has changed.
+
+        Args:
+            now: Time of the present picture, seconds.
+
+        Raises:
+            SourceError: This was failure number ``MOST_MISSES`` in a row.
+        """
         self._misses += self._asked != 0
         if self._misses >= MOST_MISSES:
             raise SourceError(
@@ -110,11 +120,15 @@ class _Bracketing:
         self._since, self._reference = now, None
 
     def _shows(self, sparse: npt.NDArray[np.float32]) -> bool:
-        """Return True if a picture's brightness fits the requested exposure better than any other exposure."""
+        """Return True if a picture's brightness fits the requested exposure better than any other exposure.
+
+        Args:
+            sparse: Linear values of every eighth pixel in both directions, (h, w, 3).
+        """
         assert self._reference is not None
         well = (self._reference > 0.05) & (self._reference < 0.9)
         if well.sum() < 30:
-            return self._waited > SETTLE_FRAMES  # too dark to decide
+            return self._waited > SETTLE_FRAMES  # too few well exposed pixels to compare
         ratio = float(sparse[well].sum() / self._reference[well].sum())
         if ratio <= 0.0:
             return self._asked == len(self.exposures) - 1
@@ -123,14 +137,17 @@ class _Bracketing:
 
 
 _DECODE = (((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4).astype(np.float32)
-"""Approximate linear value of a camera's codes; the ratios of exposures are large enough for an approximation."""
+"""Approximate linear value of each 8-bit pixel value, (256,); exposures differ enough for an approximation."""
 
 
 def _open_device(device: Any) -> Any:
-    """Return OpenCV's capture with its messages on stderr suppressed; errors are reported in one line elsewhere."""
+    """Return OpenCV's capture object of a device, opened without OpenCV's messages on stderr.
+
+    A failure is reported by `CaptureDevice` in one line.
+    """
     log: Any = cv2.utils.logging
     level = log.getLogLevel()
-    log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns for every backend without such a device
+    log.setLogLevel(log.LOG_LEVEL_ERROR)  # OpenCV warns for every backend that has no such device
     try:
         return cv2.VideoCapture(device)
     finally:

@@ -1,10 +1,11 @@
-"""Frames with more than 8 bits (16-bit camera codes or linear radiance), and their 8-bit versions.
+"""Frames with more than 8 bits, called deep frames, and their 8-bit versions.
+
+A deep frame holds 16-bit codes or linear radiance. Codes are pixel values as the camera encodes them; they are decoded
+by the camera's transfer function. Linear radiance has Rec. 709 primaries and is not decoded; 1 is the value at which an
+8-bit camera would clip, and values may exceed it. The two versions of a frame are used for:
 
     8-bit codes    marker detection, and averages over a pixel's neighbourhood
     deep frame     measurement of radiance: mirror ball, surfaces, and the picture itself
-
-16-bit codes are decoded by the camera's transfer. Linear radiance is used as it is, with Rec. 709 primaries; 1 is the
-value at which an 8-bit camera would clip, and values may exceed it.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ from warp_ar.srgb import encode_srgb
 Radiance = npt.NDArray[np.float32]
 
 CLIP_MARGINS = (1.5, 7.5)
-"""Distance below saturation, in 8-bit codes, from which a channel counts as clipped: on its own, and if another channel
-is clipped. It is half a code more than for 8-bit frames, whose codes are rounded."""
+"""Distance below saturation, in 8-bit codes, within which a channel counts as clipped. The first number applies to a
+channel on its own, the second if another channel is clipped. Both are half a code more than for 8-bit frames, whose
+codes are rounded."""
 
 _STEPS = 65536
 
@@ -50,7 +52,7 @@ class DeepFrame:
     def codes_at(
         self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], transfer: str
     ) -> npt.NDArray[np.float64]:
-        """Return the camera's codes of some pixels, scaled to 0..255 and not rounded, (..., 3).
+        """Return the codes of some pixels, scaled to 0..255 and not rounded, (..., 3).
 
         Args:
             rows: Rows of the pixels, (...).
@@ -65,7 +67,7 @@ class DeepFrame:
     def clip_levels(self, transfer: str, saturation: npt.ArrayLike = (255, 255, 255)) -> npt.NDArray[np.float32]:
         """Return the radiance above which each channel counts as clipped, (2, 3).
 
-        The first row is for a channel on its own, the second for a channel next to a clipped one.
+        The first row is for a channel on its own, the second for a channel of a pixel in which another one is clipped.
 
         Args:
             transfer: Transfer function of the camera.
@@ -85,13 +87,21 @@ def deep_table(transfer: str) -> Radiance:
 
 
 def decode_deep(codes: npt.NDArray[np.uint16], table: Radiance) -> Radiance:
-    """Return the linear values of 16-bit codes, (height, width, 3), by the table of `deep_table`."""
+    """Return the linear values of 16-bit codes, (height, width, 3).
+
+    Args:
+        codes: Codes, (height, width, 3).
+        table: Result of ``deep_table`` for the camera's transfer.
+    """
     return np.stack([table[codes[..., channel], channel] for channel in range(3)], -1)
 
 
 @functools.cache
 def _srgb_steps() -> npt.NDArray[np.uint8]:
-    """Return a table of 8-bit sRGB codes, indexed by the square root of radiance, which resolves dark codes."""
+    """Return 8-bit sRGB codes for 65536 equal steps of the square root of radiance from 0 to 1.
+
+    Equal steps of radiance itself would skip dark codes.
+    """
     return np.rint(255.0 * encode_srgb((np.arange(_STEPS) / (_STEPS - 1.0)) ** 2)).astype(np.uint8)
 
 
@@ -102,9 +112,9 @@ def srgb8(radiance: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
 
 
 def finite_light(picture: npt.NDArray[Any]) -> Radiance:
-    """Return linear radiance without NaN (set to 0) and infinity (set to the largest half float).
+    """Return linear radiance with finite values.
 
-    Negative values stay.
+    NaN and negative infinity become 0, and positive infinity the largest half float. Finite negative values stay.
     """
     return np.ascontiguousarray(np.nan_to_num(picture, nan=0.0, posinf=65504.0, neginf=0.0), np.float32)
 
@@ -124,7 +134,11 @@ def as_deep_frame(image: npt.NDArray[Any], size: tuple[int, int]) -> DeepFrame:
 
 
 def check_deep_frame(image: npt.NDArray[Any], size: tuple[int, int]) -> None:
-    """Check the array of a deep frame; arguments are those of `as_deep_frame`.
+    """Check the array of a deep frame.
+
+    Args:
+        image: RGB (height, width, 3): uint16 codes, or linear floats.
+        size: Required width and height.
 
     Raises:
         UsageError: The array has another size or type.
@@ -149,7 +163,7 @@ def codes8(deep: DeepFrame, transfer: str) -> npt.NDArray[np.uint8]:
 
 
 def check_linear(transfer: str) -> None:
-    """Check that the camera's transfer is sRGB, because linear frames are displayed with it.
+    """Check that the camera's transfer is sRGB, because linear frames are encoded as sRGB for display.
 
     Raises:
         UsageError: The transfer is another one.

@@ -1,4 +1,4 @@
-"""Alternating exposure times of a source, and the bracket that is merged from them."""
+"""Alternating exposure times of a source, and the exposure bracket that is merged from them."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ import numpy.typing as npt
 from warp_ar.errors import UsageError
 
 WAVERING = 1.1
-"""Largest ratio of exposures that count as equal; steps of a third of a stop are 1.26 (1.15 and more as rounded by
-cameras)."""
+"""Largest ratio of exposures that count as equal. A step of a third of a stop is 1.26, or 1.15 and more as cameras
+round it."""
 ADAPTING = 1.2
-"""Median step of four or more exposures below which they count as automatic exposure rather than a bracket."""
+"""Ratio of neighbouring exposures that separates a bracket from automatic exposure. If the median ratio of four or more
+exposures is smaller, they come from automatic exposure."""
 MOST_EXPOSURES = 8
 """Largest number of merged exposures; further ones in between add little."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BracketPlan:
-    """Exposures of a source that are merged, and the exposure that is shown."""
+    """Exposures of a source to merge, and the exposure to show."""
 
     ratios: tuple[float, ...]
     """Exposures relative to the shown one, longest first; empty without a bracket."""
@@ -45,9 +46,9 @@ class BracketPlan:
 def plan_bracket(exposures: Sequence[float], shown: float | None = None) -> BracketPlan:
     """Return the bracket of a source's exposures, with notes on exposures that are left out.
 
-    Exposures within the ratio ``WAVERING`` count as equal. Many exposures close to each other over a wide range come
-    from a camera's automatic exposure, and make no bracket. Of more than ``MOST_EXPOSURES``, the most evenly spread are
-    merged.
+    Exposures within the ratio ``WAVERING`` count as equal. Exposures that drift in smaller steps over a wider range
+    come from a camera's automatic exposure and make no bracket. Of more than ``MOST_EXPOSURES``, a subset in roughly
+    geometric steps is merged.
 
     Args:
         exposures: Exposure times in seconds, of all frames or each once.
@@ -92,7 +93,12 @@ def plan_bracket(exposures: Sequence[float], shown: float | None = None) -> Brac
 
 
 def _spread(times: Sequence[float], shown: float) -> list[float]:
-    """Return ``MOST_EXPOSURES`` times, including the shown one, in roughly geometric steps."""
+    """Return at most ``MOST_EXPOSURES`` of the times, including the shown one, in roughly geometric steps.
+
+    Args:
+        times: Distinct exposure times in seconds, longest first.
+        shown: Exposure time in seconds of the frames to show.
+    """
     logs = [math.log(time) for time in times]
     chosen = {min(range(len(times)), key=lambda k: abs(logs[k] - math.log(shown)))}
     for step in range(MOST_EXPOSURES):
@@ -103,9 +109,9 @@ def _spread(times: Sequence[float], shown: float) -> list[float]:
 
 
 def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
-    """Return the index of a frame's exposure in a bracket: the closest by ratio.
+    """Return the index in a bracket of the exposure closest to a frame's, by ratio.
 
-    If the frame states none, return the index of the shown exposure.
+    A frame without a known exposure time counts as one of the shown exposure.
 
     Args:
         exposure_time: Exposure time of the frame in seconds, or None.
@@ -123,12 +129,12 @@ def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
 
 
 def brightened(image: npt.NDArray[np.uint8], decode: npt.NDArray[Any], ratio: float) -> npt.NDArray[np.uint8]:
-    """Return the picture as it would look, except for noise, at the reference's exposure; for tracking and display.
+    """Return a picture scaled to the shown exposure, for tracking and display; its noise is scaled as well.
 
     Args:
         image: uint8 RGB (height, width, 3).
-        decode: Linear value of each code, (256, 3), non-decreasing.
-        ratio: Exposure time of the picture divided by the reference's.
+        decode: Linear value of each 8-bit pixel value, (256, 3), non-decreasing.
+        ratio: Exposure time of the picture divided by the shown exposure time.
     """
     table = np.empty_like(decode, np.uint8)
     for channel in range(3):

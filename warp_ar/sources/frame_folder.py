@@ -3,8 +3,8 @@
 Every picture is converted to 8-bit RGB. Grey is repeated in three channels. Alpha is dropped without blending, because
 a camera's colour does not depend on it. 16-bit values v become round(v / 257), so that 65535 becomes 255. Linear
 radiance (OpenEXR, TIFF of floats) is encoded as sRGB with values above 1 clipped; primaries that an OpenEXR states are
-converted to Rec. 709. The deep frame keeps the original depth. The image's orientation tag is applied. A folder with
-alternating exposures lists them in its sidecar, ``exposures.json``.
+converted to Rec. 709. The deep frame keeps the original bit depth. The image's orientation tag is applied. A folder
+with alternating exposures lists them in a file beside the images, ``exposures.json``.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class FrameFolder(RecordedSource):
 
 
 def read_frame(path: pathlib.Path) -> tuple[Image, DeepFrame | None]:
-    """Return an image file as 8-bit RGB, and its full depth.
+    """Return an image file as 8-bit RGB and, if it has more than 8 bits, as a deep frame.
 
     Returns:
         8-bit RGB, (height, width, 3), and the deep frame if the file has more than 8 bits, else None.
@@ -138,7 +138,7 @@ def read_frame(path: pathlib.Path) -> tuple[Image, DeepFrame | None]:
 
 
 def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return (H, W, 3) from grey, RGB or RGBA."""
+    """Return a grey, RGB or RGBA picture with three channels, (H, W, 3)."""
     if picture.ndim == 2:
         picture = picture[..., None]
     if picture.shape[2] == 1:
@@ -147,7 +147,7 @@ def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
-    """Return (H, W, 3) uint8 from grey, RGB or RGBA with 8 or 16 bits.
+    """Return a grey, RGB or RGBA picture of 8 or 16 bits as 8-bit RGB, (H, W, 3).
 
     Raises:
         SourceError: The picture has another type; the message contains ``name``.
@@ -161,9 +161,10 @@ def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
 
 
 def _read_exposures(folder: pathlib.Path) -> dict[str, float] | tuple[float, ...]:
-    """Return exposure times in seconds from the folder's sidecar, by file name or as a repeating list.
+    """Return the exposure times in seconds from a folder's ``exposures.json``.
 
-    Return an empty dictionary without sidecar.
+    Returns:
+        Exposure times by file name, or as a list that repeats over the frames; an empty dictionary without the file.
     """
     path = folder / SIDECAR
     if not os.path.lexists(path):

@@ -1,8 +1,8 @@
 """Network camera or phone, decoded by PyAV: RTSP, HTTP (including motion JPEG), and other protocols of FFmpeg.
 
 A thread decodes pictures as they arrive and keeps the newest, so that a slow reader lags by one frame instead of by a
-growing queue. A broken connection is opened again after a tenth of a second, with twice the pause after each failure.
-The source ends only after ``grace`` seconds without a picture.
+growing queue. A broken connection is opened again after a tenth of a second. Each failed attempt doubles the pause
+before the next, up to two seconds. The source ends only after ``grace`` seconds without a picture.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _RTSP = {
     # Lost UDP packets would corrupt the picture from which light is estimated; UDP is used only if a camera needs it.
     "rtsp_transport": "tcp+udp",
     "rtsp_flags": "prefer_tcp",
-    "fpsprobesize": "3",  # the stream's description states the rate: half a second less until the first picture
+    "fpsprobesize": "3",  # the stream states its rate: measuring it would delay the first picture by half a second
 }
 # Limits on the analysis of a stream before its first picture.
 _PROBING = {"probesize": "500000", "analyzeduration": "1000000"}
@@ -99,7 +99,7 @@ class NetworkStream(LiveSource):
                         break
                 self._problem = "the stream ended"
             except (av.FFmpegError, OSError, ValueError) as error:
-                # FFmpeg's error for an interrupted wait depends on where it waited.
+                # The type of FFmpeg's error after a timeout depends on the call that timed out.
                 silent = time.monotonic() - heard > 0.9 * OPEN_SECONDS
                 self._problem = f"no picture came for {OPEN_SECONDS:g} s" if silent else reason(error)
             if self._stop.is_set():
@@ -136,9 +136,9 @@ class NetworkStream(LiveSource):
             rate = float(stream.average_rate or stream.guessed_rate or 0.0)
             if rate > 0.0 and not self._told_fps:
                 self.fps = rate
-            stream.thread_type = "SLICE"  # frame threads would delay pictures by their number
+            stream.thread_type = "SLICE"  # decoding frames in parallel would delay each by the number of threads
             reformatter, last = VideoReformatter(), time.monotonic()
-            # Audio packets are read as well: if only they arrive, nothing else would end the wait for a picture.
+            # Audio packets are read as well, so that the timeout below is checked while only audio arrives.
             for packet in container.demux():
                 if self._stop.is_set():
                     return
@@ -162,7 +162,7 @@ class NetworkStream(LiveSource):
 
 
 def _without_password(address: str) -> str:
-    """Return the address for messages, without the part before @, which may contain a password."""
+    """Return the address for messages, without user name, password and query."""
     scheme, _, rest = address.partition("://")
     place, slash, path = rest.partition("/")
     return f"{scheme}://{place.rpartition('@')[2]}{slash}{path.partition('?')[0]}"

@@ -1,8 +1,8 @@
-"""Base classes of all sources, which yield each `Frame` in 8-bit RGB; recorded sources are decoded ahead.
+"""Base classes of all sources of frames, and checks of paths, rates and exposure times.
 
-A recorded source (folder, video, generated) loses no frame and is decoded a few frames ahead on one thread. A live
-source never makes the camera wait: it keeps only the newest frame, because latency matters more than completeness.
-Missing paths and invalid rates are reported here too.
+Every source yields a `Frame` in 8-bit RGB. A recorded source (folder, video, generated) loses no frame and is decoded a
+few frames ahead on one thread. A live source never makes the camera wait: it keeps only the newest frame, because
+latency matters more than completeness.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Frame:
     """Exposure time in seconds; None if the source does not state it."""
 
     deep: DeepFrame | None = None
-    """Picture at full depth, if it has more than 8 bits and ``keeps_depth`` was set on the source."""
+    """Picture at full bit depth, if it has more than 8 bits and ``keeps_depth`` was set on the source."""
 
     name: str = ""
     """Path of the frame's file; empty if it has no file of its own."""
@@ -76,7 +76,7 @@ class Frame:
 
     @property
     def deepest(self) -> DeepFrame | Image:
-        """Return the picture at full depth if known, else the 8-bit frame; a pipeline of ``linear`` frames takes it."""
+        """Return the deep frame if there is one, else the 8-bit picture; a pipeline with ``linear=True`` takes both."""
         return self.image if self.deep is None else self.deep
 
 
@@ -93,7 +93,7 @@ class Source(Closing):
     """Unit in seconds of which all frame times are whole multiples, if a recording states it; None: 1 / ``fps``."""
 
     length: int | None
-    """Number of frames in one pass, or None; for a video by its header or its duration."""
+    """Number of frames in one pass; None if unknown. A video's is read from its header or follows from its duration."""
 
     live: bool
     """True if frames are dropped while nobody takes them."""
@@ -108,16 +108,17 @@ class Source(Closing):
     """Note for users on an unexpected conversion of the frames, one line; empty if there is none."""
 
     deep: str = ""
-    """Kind of pictures with more than 8 bits: ``codes`` of the camera or linear ``light``; empty for 8 bits."""
+    """Kind of pictures with more than 8 bits: ``codes`` (encoded by the camera) or ``light`` (linear radiance); empty
+    for pictures of 8 bits."""
 
     curve: str = ""
-    """Transfer of HDR pictures, ``pq`` or ``hlg``; empty for other pictures."""
+    """Transfer function of HDR pictures, ``pq`` or ``hlg``; empty for other pictures."""
     keeps_depth: bool = False
-    """True if frames include their deep frames; must be set before reading."""
+    """True to yield deep frames with the 8-bit pictures; must be set before reading."""
 
     memory: Callable[[], Image] | None = None
-    """Function that returns memory, uint8 (height, width, 3), for a frame, for example ``Pipeline.new_frame``. Sources
-    that create pictures write them there. None: the source allocates."""
+    """Function that returns an array for a frame, uint8 (height, width, 3), such as ``Pipeline.new_frame``. Sources
+    that decode or convert pictures may write them into it. None: the source allocates."""
 
     names: tuple[str, ...] = ()
     """Paths of the frames' files; empty if frames have no files of their own."""
@@ -131,7 +132,7 @@ class Source(Closing):
         return 0
 
     def _memory_for(self, height: int, width: int) -> Image | None:
-        """Return memory for a picture of that size; None if the source must allocate it."""
+        """Return an array for a picture of that size from ``memory``; None if the source must allocate one."""
         given = None if self.memory is None else self.memory()
         return given if given is not None and given.shape == (height, width, 3) else None
 
@@ -145,7 +146,7 @@ class Source(Closing):
 
 
 class RecordedSource(Source):
-    """Source that can be read again from the start, without lost frames; decoded ahead on a thread."""
+    """Source that can be read again from the start and loses no frames; a thread decodes it ahead of the reader."""
 
     live = False
 
@@ -177,7 +178,7 @@ class RecordedSource(Source):
         """End all iterations and their threads."""
         self._closed = True
         for frames in list(self._running):
-            # A generator in use by another thread cannot be closed here; it ends with its next frame.
+            # A generator that another thread is running cannot be closed; it ends at its next frame.
             with contextlib.suppress(ValueError):
                 frames.close()
 
@@ -198,7 +199,10 @@ class RecordedSource(Source):
 
 
 def _ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
-    """Yield the items of ``frames``, computed up to FRAMES_AHEAD items early; errors keep their place in the order."""
+    """Yield the items of ``frames``, computed on a thread up to ``FRAMES_AHEAD`` items early.
+
+    An error of ``frames`` is raised when its item is due, after all earlier items.
+    """
     pending: collections.deque[Future[Frame | None]] = collections.deque()
     take = functools.partial(next, frames, None)
     with contextlib.closing(frames), ThreadPoolExecutor(1, thread_name_prefix="warp-ar-source") as executor:
@@ -215,11 +219,10 @@ def _ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]
 
 
 class _Newest:
-    """Slots for one picture each, with time and exposure.
+    """Newest picture of each exposure, with its time, for a reader on another thread.
 
-    A new picture replaces one that was not taken, which is counted as dropped.
-
-    Every exposure has its own slot, so that a slow reader does not miss the rare short exposures.
+    A new picture replaces the picture of its exposure that was not taken yet, which counts as dropped. Every exposure
+    keeps a picture of its own, so that a slow reader does not miss the rare short exposures.
     """
 
     def __init__(self) -> None:
@@ -230,7 +233,13 @@ class _Newest:
         self.dropped = 0
 
     def put(self, image: Image, time: float, exposure: float | None = None) -> bool:
-        """Offer a picture; return False if closed."""
+        """Store a picture for the reader; return False if closed.
+
+        Args:
+            image: The picture.
+            time: Time of the picture on a monotonic clock, seconds.
+            exposure: Exposure time in seconds; None if unknown.
+        """
         with self._changed:
             if self._closed:
                 return False
@@ -242,7 +251,8 @@ class _Newest:
     def close(self, error: SourceError | None = None) -> None:
         """Accept no more pictures.
 
-        Waiting readers get the remaining pictures, then ``error`` if given, else the end.
+        Readers still get the pictures that are left. After these, ``take`` raises ``error``, or returns None if no
+        error is given.
         """
         with self._changed:
             if not self._closed:
@@ -250,7 +260,11 @@ class _Newest:
             self._changed.notify_all()
 
     def take(self) -> tuple[Image, float, float | None] | None:
-        """Wait for a picture and return the oldest one; None at the end."""
+        """Wait for a picture, and return the oldest with its time and exposure; None at the end.
+
+        Raises:
+            SourceError: The error given to ``close``, once no picture is left.
+        """
         with self._changed:
             self._changed.wait_for(lambda: bool(self._items) or self._closed)
             if self._items:
@@ -282,7 +296,7 @@ class LiveSource(Source):
             self._run()
         except SourceError as error:
             self._end(error)
-        except Exception as error:  # the error, of any type, is passed to the waiting reader
+        except Exception as error:  # an error of any type must reach the waiting reader
             failed = SourceError(f"{self._name}: {reason(error)}")
             failed.__cause__ = error
             self._end(failed)
@@ -301,7 +315,7 @@ class LiveSource(Source):
         return self._newest.dropped
 
     def __iter__(self) -> Iterator[Frame]:
-        """Iterate over new frames, always taking the newest; ends when the source is closed."""
+        """Iterate over new frames, skipping all but the newest of each exposure; ends when the source is closed."""
         while (item := self._newest.take()) is not None:
             image, stamp, exposure = item
             if self._index == 0:
@@ -311,7 +325,7 @@ class LiveSource(Source):
             yield frame
 
     def close(self) -> None:
-        """Accept no more frames; iteration ends after those left."""
+        """Accept no more frames; iteration ends after the frames that are left."""
         self._newest.close()
 
 
@@ -330,7 +344,7 @@ class QueueSource(LiveSource):
         self.size, self.fps, self.description = size, fps, f"{description} ({size[0]}x{size[1]})"
 
     def push(self, image: Image, time: float) -> bool:
-        """Offer a frame from any thread; it replaces a frame that was not yet taken.
+        """Add a frame, from any thread; it replaces a frame that was not yet taken.
 
         Args:
             image: uint8 RGB, (height, width, 3); must not be changed afterwards.

@@ -4,7 +4,7 @@ Every source yields a `Frame` in 8-bit RGB. A recorded source (folder, video, ge
 few frames ahead on one thread. A live source (device, stream, queue) keeps only the newest frame, because latency
 matters more than completeness; ``dropped`` counts the skipped frames.
 
-Frames may alternate between exposures. Only one exposure is shown; the others provide the light that clips in it.
+Frames may alternate between exposures. Only one exposure is shown; the others measure light that clips in it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def open_source(
             URL of a camera's stream (``rtsp://...``, ``http://...``), or ``synthetic:NAME``.
         fps: Frames per second: the rate of a folder (default 30), a new rate for a video, or the rate requested from a
             device.
-        loop: Start again at the end, with index and time going on. Without effect on live sources.
+        loop: Start again at the end; index and time of the frames continue. Without effect on live sources.
         exposures: Exposure times in seconds that repeat over the frames: those of a recording, or those to request from
             a device.
 
@@ -88,9 +88,11 @@ def open_source(
 
 
 def source_of(scene: Scene, given: str | int | pathlib.Path | None = None) -> str | int | pathlib.Path | None:
-    """Return the argument of ``open_source`` for the given frames, or else for the scene's own.
+    """Return the given source, or else the scene's own, as an argument for ``open_source``; None if there is neither.
 
-    Return None if there are neither.
+    Args:
+        scene: The scene.
+        given: Source that replaces the scene's own.
     """
     if given is not None or scene.source is None:
         return given
@@ -99,7 +101,12 @@ def source_of(scene: Scene, given: str | int | pathlib.Path | None = None) -> st
 
 
 def open_scene_source(scene: Scene, given: str | int | pathlib.Path | None, *, loop: bool) -> Source:
-    """Open the given source, or else the scene's own source with the scene's settings.
+    """Open the given source, or else the scene's own source with the scene's rate and exposures.
+
+    Args:
+        scene: The scene.
+        given: Source that replaces the scene's own.
+        loop: Start again at the end.
 
     Raises:
         SourceError: The source cannot be opened.

@@ -16,10 +16,10 @@ Image = npt.NDArray[np.uint8]
 
 
 class Synthetic(RecordedSource):
-    """A generated clip, the same in every run.
+    """Generated clip, the same in every run.
 
     ``checker`` is a sliding checkerboard. ``card`` is a marker seen by a moving camera, with ground truth in `pose` and
-    `camera_matrix`. The marker is ``DICT_4X4_50`` number 0, its black square ``MARKER_SIZE`` metres wide.
+    `camera_matrix`. The marker is number 0 of ``DICT_4X4_50``; its black square is ``MARKER_SIZE`` metres wide.
 
     Args:
         name: ``card`` or ``checker``.
@@ -62,7 +62,7 @@ class Synthetic(RecordedSource):
         return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
 
     def pose(self, index: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return (R, t) of a frame of ``card``.
+        """Return rotation R (3, 3) and translation t (3,) of frame ``index`` of ``card``, ``camera_from_world``.
 
         A point X of the marker's frame, in metres, is R X + t in the camera's frame (x right, y down).
         """
@@ -85,8 +85,8 @@ class Synthetic(RecordedSource):
         world_from_texel = np.array([[metres, 0, -middle * metres], [0, -metres, middle * metres], [0, 0, 1]])
         rotation, translation = self.pose(index)
         pixel_from_world = self.camera_matrix @ np.column_stack([rotation[:, :2], translation])
-        # Drawn at twice the size and averaged: a coarse pixel's centre is half a fine pixel beyond the even fine
-        # pixel's centre.
+        # The picture is drawn at twice the resolution and averaged. Pixel x covers the fine pixels 2 x and 2 x + 1, so
+        # that its centre is at the fine coordinate 2 x + 1/2.
         fine_from_pixel = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
         width, height = self.size
         fine = cv2.warpPerspective(

@@ -1,9 +1,10 @@
 """Video file as a source of frames, with rotation, pixel shape and edit list of its container applied.
 
-Pictures with more than 8 bits, and HDR pictures, are deep frames as well. A standard signal of 10 to 16 bits becomes
-16-bit codes, decoded by the camera's transfer like 8-bit codes. A PQ or HLG signal becomes linear radiance with
-reference white at 1 and Rec. 709 primaries instead of BT.2020 or P3. FFmpeg only upsamples chroma. Matrix, range and
-transfer are computed here, because FFmpeg's own conversion to 16-bit RGB is off by 0.4 %.
+Pictures with more than 8 bits, and HDR pictures, also yield deep frames. A signal of 10 to 16 bits with standard
+transfer and primaries becomes 16-bit codes, which are decoded by the camera's transfer. A PQ or HLG signal becomes
+linear radiance with reference white at 1 and Rec. 709 primaries. So does a signal of more than 8 bits with BT.2020 or
+P3 primaries. For deep frames, FFmpeg only upsamples chroma. Matrix, range and transfer are computed here, because
+FFmpeg's own conversion to 16-bit RGB is off by 0.4 %.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ from warp_ar.srgb import decode_srgb
 
 Image = npt.NDArray[np.uint8]
 Taken: TypeAlias = tuple[Image, float | None, DeepFrame | None]
-"""8-bit picture, its time stamp in seconds, and its deep frame if these are kept."""
+"""8-bit picture, its time stamp in seconds (None if it has none), and its deep frame if deep frames are kept."""
 
 # Containers of video only: FFmpeg also renders text as pictures, and follows play lists to other files and hosts.
 _FORMATS = (
     "mov,mp4,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,flv,live_flv,asf,ogg,mxf,dv,nut,"
     "mjpeg,mjpeg_2000,gif,apng,yuv4mpegpipe,wtv,rm,vc1,vc1test,swf,r3d,bink,roq,nsv,smk,gxf,wav"
 )
-# For these formats, FFmpeg converts to planar RGB in half the time of interleaved RGB, with identical results. Only
-# with subsampled chroma and an odd number of rows do some codes differ by one.
+# FFmpeg converts these formats to planar RGB in half the time of interleaved RGB. The results are identical, except
+# that some codes differ by one if chroma is subsampled and the number of rows is odd.
 _IN_PLANES = frozenset(
     ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "yuv420p10le", "p010le")
 )
@@ -67,7 +68,7 @@ TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FUL
 
 _STEPS = 65536
 
-# Encoders write rounding of the size as a pixel aspect ratio: 854x480 for 16:9 has 1280:1281.
+# If an encoder has rounded the picture's size, the pixel aspect ratio compensates: 854x480 for 16:9 has 1280:1281.
 _NEARLY_SQUARE = 0.005
 
 
@@ -164,7 +165,7 @@ class VideoFile(RecordedSource):
                 yield Frame(index, seconds, image, deep=deep)
 
     def _pictures(self, container: Any, first: int | None = None) -> Generator[Taken, None, None]:
-        """Yield every picture with its time stamp in seconds, and its deep frame if these are kept.
+        """Yield every picture with its time stamp in seconds, and its deep frame if deep frames are kept.
 
         All pictures before a damaged place are yielded before the error is raised.
 
@@ -178,7 +179,7 @@ class VideoFile(RecordedSource):
             yield self._taken(reformatter, picture)
 
     def _decoded(self, container: Any, first: int | None) -> Generator[Any, None, None]:
-        """Yield the pictures of ``_pictures`` as decoded by PyAV."""
+        """Yield the pictures as PyAV decodes them; the arguments are those of ``_pictures``."""
         stream = container.streams.video[0]
         stream.thread_type, stream.codec_context.thread_count = "AUTO", self._decoders
         count, packets, damage = 0, 0, ""
@@ -215,7 +216,7 @@ class VideoFile(RecordedSource):
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
 
     def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
-        """Return 8-bit RGB of a picture, its time stamp in seconds, and its deep frame if these are kept."""
+        """Return 8-bit RGB of a decoded picture, its time stamp in seconds, and its deep frame if they are kept."""
         if self.deep != "light":
             deep = deep_frame_from_video(reformatter, picture, self._shape) if self.deep and self.keeps_depth else None
             return rgb_from_video(reformatter, picture, self._memory_for, self._shape), picture.time, deep
@@ -246,7 +247,7 @@ def video_stream(container: Any, name: str) -> Any:
 
 
 def _frames_shown(stream: Any) -> int:
-    """Return the number of frames by the header, without those that an edit list removes; 0 if unknown."""
+    """Return the number of frames that the header states, without those that an edit list removes; 0 if unknown."""
     left_out = sum(entry.is_discard for entry in stream.index_entries)
     return min(stream.frames, len(stream.index_entries) - left_out) if left_out else int(stream.frames)
 
@@ -257,12 +258,14 @@ def rgb_from_video(
     memory: Callable[[int, int], Image | None] | None = None,
     shape: fractions.Fraction = fractions.Fraction(1),
 ) -> Image:
-    """Return 8-bit RGB of a decoded picture with its own colour matrix and range, rotated and with square pixels.
+    """Return 8-bit RGB of a decoded picture, rotated and with square pixels.
+
+    Colour matrix and range are those that the picture states.
 
     Args:
         reformatter: Reformatter of the current thread.
         picture: Picture decoded by PyAV.
-        memory: Function from height and width to memory for the result, or to None: a new array is allocated.
+        memory: Function of height and width that returns an array for the result, or None to allocate one.
         shape: Pixel aspect ratio, as returned by ``pixel_shape``.
     """
     matrix = None
@@ -281,7 +284,12 @@ def rgb_from_video(
 
 
 def _interleaved(picture: Any, out: Image | None) -> Image:
-    """Return interleaved RGB of a picture with planar green, blue and red, in ``out`` or a new array."""
+    """Return interleaved RGB, (height, width, 3), of a picture with planes in the order green, blue, red.
+
+    Args:
+        picture: Picture of PyAV.
+        out: Array for the result; None to allocate one.
+    """
     green, blue, red = (
         np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
         for plane in picture.planes
@@ -290,7 +298,10 @@ def _interleaved(picture: Any, out: Image | None) -> Image:
 
 
 def depth_of(context: Any) -> str:
-    """Return the kind of a stream's pictures beyond 8 bits, in the form of ``Source.deep``.
+    """Return the kind of a stream's deep frames.
+
+    ``light`` stands for linear radiance (from PQ or HLG, or from more than 8 bits with BT.2020 or P3 primaries),
+    ``codes`` for other pictures with more than 8 bits. The result is empty for streams without deep frames.
 
     Args:
         context: Codec context of the stream, by PyAV.
@@ -306,26 +317,35 @@ def depth_of(context: Any) -> str:
 
 
 def curve_of(context: Any) -> str:
-    """Return the transfer of an HDR stream, in the form of ``Source.curve``; the argument is as in ``depth_of``."""
+    """Return the transfer function of an HDR stream, ``pq`` or ``hlg``; empty for other streams.
+
+    Args:
+        context: Codec context of the stream, by PyAV.
+    """
     return {int(ColorTrc.SMPTE2084): "pq", int(ColorTrc.ARIB_STD_B67): "hlg"}.get(int(context.color_trc), "")
 
 
 def pixel_shape(stream: Any) -> fractions.Fraction:
-    """Return the width of a stream's pixels divided by their height; 1 if unknown or within rounding of 1."""
+    """Return the width of a stream's pixels divided by their height; 1 if unknown or nearly 1."""
     shape = fractions.Fraction(stream.sample_aspect_ratio or 1)
     return shape if shape > 0 and abs(shape - 1) > _NEARLY_SQUARE else fractions.Fraction(1)
 
 
 def square_width(width: int, shape: fractions.Fraction) -> int:
-    """Return the number of columns of a picture after conversion to square pixels."""
+    """Return the number of columns of a picture after conversion to square pixels.
+
+    Args:
+        width: Number of columns before it.
+        shape: Pixel aspect ratio, as returned by ``pixel_shape``.
+    """
     return max(1, round(width * shape))
 
 
 def turn_of(picture: Any) -> tuple[bool, bool, bool]:
-    """Return the operations that rotate a decoded picture upright: transpose, then flip columns, then flip rows.
+    """Return three flags for turning a decoded picture upright: transpose, reverse the columns, reverse the rows.
 
-    The display matrix of the container or stream maps (x, y) to (a x + c y, b x + d y). The nearest of the eight
-    rotations and reflections that keep pixels is used.
+    The operations are applied in this order. The display matrix of the container or stream maps (x, y) to (a x + c y,
+    b x + d y). It is replaced by the nearest of the eight rotations and reflections that map pixels to pixels.
     """
     said = picture.side_data.get(SideDataType.DISPLAYMATRIX)
     if said is None:
@@ -355,7 +375,7 @@ def presented(image: _Picture, picture: Any, shape: fractions.Fraction) -> _Pict
 def deep_frame_from_video(
     reformatter: VideoReformatter, picture: Any, shape: fractions.Fraction = fractions.Fraction(1)
 ) -> DeepFrame:
-    """Return the deep frame of a decoded picture, by its own matrix, range, transfer and primaries.
+    """Return the deep frame of a decoded picture, with the colour matrix, range, transfer and primaries it states.
 
     Args:
         reformatter: Reformatter of the current thread.
@@ -377,19 +397,26 @@ def _last_code() -> int:
 
 
 def _steps(signal: Float) -> npt.NDArray[np.int32]:
-    """Return the nearest of 65536 steps from 0 to 1; values outside are clamped."""
+    """Return a signal, nominally 0 to 1, as whole numbers 0 to 65535; values outside are clamped."""
     return (np.clip(signal, 0.0, 1.0) * np.float32(_STEPS - 1) + np.float32(0.5)).astype(np.int32)
 
 
 @functools.cache
 def _light_table(transfer: int) -> Float:
-    """Return the linear value of each of 65536 steps of a signal."""
+    """Return the linear value of each of 65536 equal steps of a signal from 0 to 1, (65536,).
+
+    Args:
+        transfer: FFmpeg's number of the transfer function; every one but PQ and HLG is decoded as sRGB.
+    """
     curve = {int(ColorTrc.SMPTE2084): light_of_pq, int(ColorTrc.ARIB_STD_B67): light_of_hlg}.get(transfer, decode_srgb)
     return curve(np.arange(_STEPS) / (_STEPS - 1.0)).astype(np.float32)
 
 
 def _signal(reformatter: VideoReformatter, picture: Any) -> Float:
-    """Return R'G'B' of a picture, (height, width, 3), nominally 0 to 1 with the excursions that its coding allows."""
+    """Return the encoded R'G'B' of a picture, (height, width, 3), nominally 0 to 1.
+
+    A coding with limited range allows values slightly below 0 and above 1.
+    """
     bits = picture.format.components[0].bits
     kind = "gbrp" if picture.format.is_rgb else "yuv444p"
     wanted = kind if bits == 8 else f"{kind}{bits}le"
@@ -403,7 +430,15 @@ def _signal(reformatter: VideoReformatter, picture: Any) -> Float:
 
 
 def _rgb_of_yuv(planes: list[Float], picture: Any, bits: int) -> Float:
-    """Return R'G'B' of Y'CbCr without subsampling (BT.709-6 and BT.2020-2, quantisation and non-constant luminance)."""
+    """Return R'G'B', (height, width, 3), of Y'CbCr planes of full resolution.
+
+    Quantisation and matrices are those of BT.709-6 and BT.2020-2 (non-constant luminance).
+
+    Args:
+        planes: Y', Cb and Cr as stored, (height, width) each.
+        picture: Picture that states range and matrix.
+        bits: Bits per value.
+    """
     unit = float(2 ** (bits - 8))
     if picture.color_range == ColorRange.JPEG:
         black, luma, chroma = 0.0, 2.0**bits - 1.0, 2.0**bits - 1.0

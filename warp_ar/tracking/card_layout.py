@@ -1,8 +1,8 @@
 """Layout of the printed card: one sheet with marker board, white and grey reference patches, and a place for the ball.
 
-The sheet's board is the scene's marker: the world's origin is the board's centre, x right, y up the page, z out of it.
-Everything else on the sheet has a fixed position in that frame, so the position of a scene's ball follows from its
-radius.
+The card's board is the scene's marker. It defines the world's frame: the origin is the board's centre, x points right,
+y up the page, z out of it. Everything else on the card has a fixed position in that frame, so the centre of the mirror
+ball follows from its radius.
 """
 
 from __future__ import annotations
@@ -18,28 +18,31 @@ from warp_ar.scene import CharucoBoard, Marker
 Image = NDArray[np.uint8]
 
 CARD_MARKER: Final = Marker(dictionary="DICT_4X4_50", board=CharucoBoard(5, 4, 0.032, 0.024))
-"""Board of the sheet, with few and large cells that a camera of 640 x 480 resolves at arm's length."""
+"""Board of the card; its few, large cells are resolved by a camera of 640 x 480 at arm's length."""
 BALL_PLACE: Final = (0.0, 0.114)
-"""Point where the ball touches the sheet, metres: behind the board, so that the ball does not hide it from the
-front."""
+"""Point where the ball touches the card, metres. It is behind the board, so that the ball does not hide the board from
+a camera in front."""
 RINGS: Final = (0.020, 0.025, 0.030, 0.035, 0.040)
-"""Radii in metres of the rings around ``BALL_PLACE``; from straight above, a ball hides the ring of its own radius."""
+"""Radii in metres of the printed rings around ``BALL_PLACE``. Seen from above, a ball just covers the ring of its own
+radius, which shows the radius to the user."""
 GREYS: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Area fraction of black ink dots in each grey patch; its reflectance does not depend on the printer's tone curve."""
+"""Fraction of each grey patch that is covered by black dots. With dots instead of grey ink, the reflectance of a patch
+does not depend on the printer's tone curve."""
 GREY_SIZE: Final = (0.026, 0.010)
 """Width and height of a grey patch, metres."""
 
 _TOP: Final = 0.052
-"""Distance in metres from the top of Letter paper to the ball's place; taller paper has equal surplus at both ends."""
+"""Distance in metres from the top of Letter paper to the ball's place. On taller paper the layout is centred: half of
+the additional height is at the top."""
 _LETTER_HEIGHT: Final = 0.2794
 _DOTS: Final = 4
-"""Size of the repeating grid whose cells are the dots of a grey patch."""
+"""Number of dots along each side of the square grid that repeats over a grey patch."""
 _DOT: Final = 0.00025
-"""Side of a dot in metres: too small for a camera to resolve, large enough for ink that spreads."""
+"""Side of a dot in metres: too small for a camera to resolve, but large compared with the spread of ink."""
 
 
 def grey_centers() -> NDArray[np.float64]:
-    """Return the centres of the grey patches in the board's frame, (n, 3) metres, in the order of ``GREYS``."""
+    """Return the centres of the grey patches, (n, 3) metres in the board's frame, in the order of ``GREYS``."""
     assert isinstance(CARD_MARKER.board, CharucoBoard)
     pitch, height = CARD_MARKER.board.square_length, CARD_MARKER.board.size[1]
     x = (np.arange(len(GREYS)) - (len(GREYS) - 1) / 2) * pitch
@@ -47,12 +50,16 @@ def grey_centers() -> NDArray[np.float64]:
 
 
 def ball_center(radius: float) -> tuple[float, float, float]:
-    """Return the centre in metres of a ball that stands on its place on the sheet."""
+    """Return the centre, in metres, of a ball of a radius in metres that stands on its place on the card."""
     return (*BALL_PLACE, radius)
 
 
 def board_top(height: float) -> float:
-    """Return the distance in metres of the board's centre from the upper edge of paper of a height."""
+    """Return the distance in metres from the upper edge of the paper to the board's centre.
+
+    Args:
+        height: Height of the paper, metres.
+    """
     return _TOP + BALL_PLACE[1] + (height - _LETTER_HEIGHT) / 2
 
 
@@ -72,7 +79,7 @@ def draw_page(size: tuple[float, float], pixels_per_metre: float, board: Image) 
     origin = np.array([width / 2, board_top(height)])
 
     def pixel(x: float, y: float) -> tuple[int, int]:
-        """Return column and row of a point of the board's frame."""
+        """Return column and row of a point in the board's frame."""
         return round((origin[0] + x) * pixels_per_metre), round((origin[1] - y) * pixels_per_metre)
 
     column, row = pixel(0.0, 0.0)
@@ -88,7 +95,13 @@ def draw_page(size: tuple[float, float], pixels_per_metre: float, board: Image) 
 
 
 def _grey(share: float, shape: tuple[int, int], dot: int) -> Image:
-    """Return a dot pattern that covers a share of a patch: cells of a repeating grid, added in a dispersed order."""
+    """Return a grey patch as black dots on white, by ordered dithering with a 4x4 Bayer matrix; uint8, 0 or 255.
+
+    Args:
+        share: Fraction of the patch that is black.
+        shape: Rows and columns of the patch, pixels.
+        dot: Side of a dot, pixels.
+    """
     order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
     cells = np.where(order < share * _DOTS**2, 0, 255).astype(np.uint8)
     dot = max(dot, 1)
@@ -110,7 +123,7 @@ def _draw_place(page: Image, center: tuple[int, int], pixels_per_metre: float) -
 
 
 def _draw_rulers(page: Image, pixels_per_metre: float) -> None:
-    """Draw a ruler of 100 mm in each direction, because printers scale both separately, and the instructions."""
+    """Draw the instructions and two rulers of 100 mm, one per direction, because printers scale each separately."""
     mm = pixels_per_metre / 1e3
     thin, left, bottom = max(1, round(0.2 * mm)), round(12 * mm), page.shape[0] - round(12 * mm)
     top = bottom - round(100 * mm)
@@ -132,6 +145,6 @@ def _draw_rulers(page: Image, pixels_per_metre: float) -> None:
 
 
 def _write(page: Image, text: str, place: tuple[int, int], pixels_per_metre: float, height: float) -> None:
-    """Write text whose capitals are ``height`` metres high; OpenCV's are 21 pixels at scale 1."""
+    """Write text with capitals of ``height`` metres; OpenCV's capitals have 21 pixels at scale 1."""
     scale = height * pixels_per_metre / 21
     cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 0, max(1, round(1.6 * scale)), cv2.LINE_8)

@@ -1,26 +1,27 @@
-"""Drift of a camera's exposure and white balance, estimated from still surfaces.
+"""Drift of a camera's exposure and white balance, estimated from static surfaces.
 
 Automatic exposure and white balance scale the whole picture: every surface, lit or in shadow, becomes brighter by the
 same factor per channel. A change of the light does not: surfaces that an emitter reaches change, surfaces in its shadow
 do not. So points on the card's paper and on the planes around it are observed in each frame, at fixed places in the
-world. The first observation of each point is stored. With d_i the change of the logarithm of the radiance of point i
-since then, per channel, and m the median of d_i,
+world. The first observation of each point is stored. Let d_i be the change of the logarithm of the radiance of point i
+since its first observation, per channel, and m the median of d_i over the points. Then
 
-    the gain is exp(m)    where the points agree: a share ``AGREEING`` of |d_i - m| is below ``SPREAD`` |m|.
+    the gain is exp(m)    if the points agree: for a share ``AGREEING`` of them, |d_i - m| is below ``SPREAD`` |m|.
 
-Until a drift is known, card and planes must also agree with each other; afterwards a hand may cover one of them. A gain
-counts as drift only above ``LEAST``, so that a camera with fixed exposure is not affected. Where points disagree,
-because the light changes or something covers them, the last gain is kept for ``PATIENCE`` frames and then set to 1.
-Light that dims on all surfaces equally cannot be distinguished from a change of exposure and counts as one. Drift is
-therefore estimated only if the scene sets ``metering = "automatic"``.
+Until a drift is known, card and planes must also agree with each other. Afterwards a hand may cover one of them. A gain
+counts as drift only if its logarithm exceeds ``LEAST``, so that a camera with fixed exposure is not affected. If the
+points disagree, because the light changes or something covers them, the last gain is kept for ``PATIENCE`` frames and
+then set to 1. Light that dims on all surfaces equally cannot be distinguished from a change of exposure and counts as
+one. Drift is therefore estimated only if the scene sets ``metering = "automatic"``.
 
-Paper is at most ``MOST_PRINT`` times as bright as ink on it. If the card appears to have more contrast, the camera
-applies an S-shaped tone curve after its transfer (``without_contrast``). The smallest contrast that explains the print
-is used.
+Codes are the camera's 8-bit pixel values. Paper is at most ``MOST_PRINT`` times as bright as ink on it. If the card
+appears to have more contrast, the camera applies an S-shaped tone curve after its transfer function. The curve has one
+parameter, the contrast of ``without_contrast``. The smallest contrast that explains the print is used.
 
-A drift also serves as an exposure bracket. Under a tone curve, mid-tones change more than dark and bright tones, so
-points of different codes disagree. The estimated contrast is the one under which the medians over bins of codes agree
-best, if their disagreement is below ``BETTER`` times the disagreement without contrast.
+A drift also helps to estimate the contrast, because it shows the same surfaces at several exposures. Under a tone
+curve, mid-tones change more than dark and bright tones, so points of different codes disagree. The points are sorted
+into bins by their first codes. The estimated contrast is the one under which the medians of the bins agree best, if
+their disagreement is below ``BETTER`` times the disagreement without contrast.
 """
 
 from __future__ import annotations
@@ -42,57 +43,59 @@ from warp_ar.tracking.markers import printed_cells
 Array = NDArray[np.float64]
 
 GRID = 21
-"""Points along each side of a plane."""
+"""Number of points along each side of a plane."""
 LEAST_POINTS = 24
-"""Smallest number of points that must be visible again."""
+"""Smallest number of points, observed before, that a frame must show for an estimate."""
 LEAST = 0.05
-"""Smallest logarithm of the gain, over all channels, that counts as a drift."""
+"""Smallest length of the vector (3,) of the channels' log gains that counts as a drift."""
 AGREEING = 0.7
 """Share of points that must agree."""
 SPREAD = 0.3
-"""Largest deviation from the median, as a share of the median's magnitude."""
+"""Largest allowed deviation from the median, as a share of the median's magnitude."""
 FURTHEST = 0.06
 """Upper bound on the allowed deviation from the median, as a logarithm. A distant emitter that changes affects nearby
 surfaces almost equally; their deviations exceed this bound."""
 NOISE = 0.09
-"""Allowed deviation once a drift is known, as a logarithm: covers tone curve, blurred texture, noise and
+"""Largest allowed deviation once a drift is known, as a logarithm. It covers tone curve, blurred texture, noise and
 compression."""
 CARD = 0.15
-"""Largest difference of logarithms between card and planes: they lie on different parts of a tone curve."""
+"""Largest difference between the median changes of card and planes, as a logarithm. They differ under a tone curve,
+because card and planes have different codes."""
 PATIENCE = 4
 """Number of consecutive frames with disagreeing points after which the gain is set to 1."""
 DARK, BRIGHT = 12, 250
-"""Range of codes that are used; outside it are quantisation and clipping."""
+"""Range of codes that are used: darker ones are coarsely quantised, brighter ones may be clipped."""
 CONTRASTS = np.linspace(0.0, 1.0, 5)
-"""Contrasts that are tried, beginning with none."""
+"""Contrasts that are tried, beginning with 0."""
 MOST_PRINT = 30.0
 """Largest ratio of paper to ink: 90 % reflectance to 3 %."""
 BINS = (0.2, 0.35, 0.5, 0.65, 0.8)
-"""Borders, as codes divided by 255, of the bins whose medians are compared."""
+"""Borders of the bins whose medians are compared, as codes divided by 255."""
 BIN_POINTS = 4
-"""Smallest number of points in a bin."""
+"""Smallest number of points in a bin, or on the card, for a median."""
 BETTER = 0.85
 """Largest ratio of the disagreement with contrast to that without, for the contrast to be used."""
 TELLING = 0.08
-"""Smallest logarithm of a channel's gain from which a frame contributes to the contrast estimate."""
+"""Smallest logarithm of a channel's gain for which the channel contributes to the estimate of contrast."""
 FIRST_LOOKS = 9
-"""Number of contributing channels before the first estimate; it is repeated whenever their number has doubled."""
+"""Number of contributions, one per channel and frame, before contrast is first estimated from a drift. The estimate is
+repeated each time the number has doubled."""
 _OFFSETS = np.array([(x, y) for y in (-2, 0, 2) for x in (-2, 0, 2)])
 """Offsets of the pixels around a point that are averaged."""
 
 
 class ExposureDrift:
-    """Estimator of the camera's gain over the frames; the gain is 1 until a drift is detected."""
+    """Estimator of the camera's gain relative to its first frame; the gain is 1 until a drift is detected."""
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
-        """Choose points.
+        """Choose the points to observe.
 
         Args:
             scene: Scene with a marker.
             camera: Camera of the frames.
         """
         self.watches = (camera, scene.marker, scene.proxies, scene.probes)
-        """Inputs that determine the result for given frames; equal values allow one instance to be shared."""
+        """Inputs besides the frames on which estimates depend. Pipelines with equal inputs can share an instance."""
         self._camera = camera
         self._plain = decode_table(camera.transfer).astype(np.float64)
         self._points, self._is_card, self._is_ink = still_points(scene)
@@ -123,8 +126,8 @@ class ExposureDrift:
 
         Args:
             image: uint8 RGB (height, width, 3).
-            deep: The frame at full depth, used instead of ``image`` if given.
             pose: ``camera_from_world``.
+            deep: The frame at full bit depth, used instead of ``image`` if given.
 
         Returns:
             True if the gain or the contrast has changed.
@@ -151,23 +154,31 @@ class ExposureDrift:
         """Return the change of the logarithm of each point's radiance since its first observation, (n, 3).
 
         Args:
-            codes: Present codes of the points, (n, 3).
-            contrast: Assumed contrast of the camera.
+            codes: Codes of the points in the present frame, (n, 3).
+            contrast: Assumed contrast of the camera's tone curve.
         """
         change = self._logarithm(codes, contrast) - self._logarithm(self._first, contrast)
         return np.asarray(change + np.log(self._first_gain))
 
     def _logarithm(self, codes: Array, contrast: float) -> Array:
-        """Return the logarithm of the radiance of codes (n, 3) under a contrast, (n, 3)."""
+        """Return the logarithm of the radiance of codes, (n, 3), if the camera's tone curve has a given contrast.
+
+        Args:
+            codes: Codes, (n, 3).
+            contrast: Assumed contrast.
+        """
         table = np.log(np.maximum(without_contrast(self._plain, contrast, self.saturation), 1e-6))
         return np.stack([np.interp(codes[:, c], np.arange(256), table[:, c]) for c in range(3)], -1)
 
     def _weigh(self, change: Array, is_card: NDArray[np.bool_]) -> Array | None:
-        """Return the logarithm of the gain; None if the points disagree.
+        """Return the logarithm of the gain per channel, (3,); None if points disagree or too few are visible.
+
+        Before a drift is known, points may disagree while their median changes by at most ``LEAST``; the result is
+        then 0. It is also 0 if no point was observed before.
 
         Args:
             change: Change of the logarithm of radiance since each point's first observation, (k, 3).
-            is_card: True for points of the card, (k,).
+            is_card: True for points on the card, (k,).
         """
         if not np.isfinite(self._first).any():
             return np.zeros(3)
@@ -180,7 +191,7 @@ class ExposureDrift:
         if BIN_POINTS <= is_card.sum() <= len(change) - BIN_POINTS:
             apart = float(np.abs(np.median(change[is_card], axis=0) - np.median(change[~is_card], axis=0)).max())
         if self._moving:
-            # A hand may cover the card and those planes' points that need not agree.
+            # Card and planes are no longer compared, because a hand may cover the card.
             return middle if off <= NOISE else None
         if off > min(SPREAD * size / np.sqrt(3.0), FURTHEST) or apart > CARD:
             return None if size > LEAST else np.zeros(3)
@@ -188,7 +199,7 @@ class ExposureDrift:
         return middle
 
     def _ask_contrast(self, codes: Array) -> None:
-        """Add a frame's evidence on the contrast, and choose the best contrast once there is enough."""
+        """Add a frame's evidence on the contrast, and update the contrast once there is enough evidence."""
         changes = [self._change(codes, float(contrast)) for contrast in CONTRASTS]
         for c in range(3):
             seen = ~np.isnan(changes[0][:, c])
@@ -209,7 +220,10 @@ class ExposureDrift:
             self.contrast = max(self.contrast, float(CONTRASTS[best]))
 
     def _print_contrast(self, codes: Array) -> float:
-        """Return the smallest contrast of the camera under which the card's ink is no darker than print."""
+        """Return the smallest contrast under which paper is at most ``MOST_PRINT`` times as bright as ink.
+
+        The result is the largest of ``CONTRASTS`` if none suffices, and 0 if too few points are visible.
+        """
         shown = [codes[part & ~np.isnan(codes).any(axis=1)] for part in (self._is_card, self._is_ink)]
         if min(len(part) for part in shown) < BIN_POINTS:
             return 0.0
@@ -224,14 +238,17 @@ class ExposureDrift:
 def codes_around(
     image: NDArray[np.uint8], camera: Camera, pose: Pose, points: Array, deep: DeepFrame | None = None
 ) -> Array:
-    """Return mean codes around points, (n, 3); NaN for points that are not visible or clipped.
+    """Return the mean code of nine pixels around each point, (n, 3).
+
+    It is NaN for points outside the picture and for points with a code not between ``DARK`` and ``BRIGHT``.
 
     Args:
         image: uint8 RGB (height, width, 3).
         camera: Camera of the frame.
         pose: ``camera_from_world``.
         points: World points in metres, (n, 3).
-        deep: The frame at full depth, if given; its codes are scaled to 0..255 and not rounded.
+        deep: The frame at full bit depth, used instead of ``image`` if given; its codes are scaled to 0..255 and not
+            rounded.
     """
     result = np.full((len(points), 3), np.nan)
     pixels = project(camera, pose.apply(points))
@@ -251,7 +268,14 @@ def codes_around(
 
 
 def under_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
-    """Return a mask of points (n, 3) that lie inside a static box or within a centimetre of one."""
+    """Return a mask, (n,), of the points inside a static box of the scene or near one.
+
+    A point is near if its coordinates in the box's frame exceed half the box's size by less than a centimetre.
+
+    Args:
+        scene: Scene with the boxes; boxes attached to markers are not static.
+        points: World points in metres, (n, 3).
+    """
     hidden = np.zeros(len(points), bool)
     for box in scene.proxies:
         if box.shape == "box" and box.marker is None:
@@ -261,9 +285,12 @@ def under_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
 
 
 def still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return points on the card and on planes, without those under boxes or near balls, (n, 3).
+    """Return points on the card and on static planes, for observation.
 
-    Also return masks of the points on paper and of those on ink.
+    Points of the planes that are under a static box, near the card or near a ball are left out.
+
+    Returns:
+        World points in metres, (n, 3), and masks (n,) of the points on the card's paper and of those on its ink.
     """
     cells, white, _, outline = printed_cells(scene.marker)
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]

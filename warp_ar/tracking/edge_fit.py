@@ -1,4 +1,8 @@
-"""Fitting of poses to a marker's printed edges by Gauss-Newton, in NumPy; the derivation is in ``tracking``."""
+"""Fitting of poses to a marker's printed edges by Gauss-Newton, in NumPy.
+
+The module ``tracking`` derives the equations. The reach of an edge point is half the width in pixels of the window,
+across the edge, over which the picture is sampled.
+"""
 
 from __future__ import annotations
 
@@ -22,32 +26,34 @@ Box = tuple[slice, slice]
 NOISE_FLOOR: Final = 0.03
 """Smallest standard deviation in pixels that is assumed for an edge point (sampling, lens model, print)."""
 CORRELATED: Final = 2.0
-"""Number of neighbouring edge points that count as one, because they share pixels."""
+"""Number of neighbouring edge points that count as one independent measurement, because they share pixels."""
 _TAPS: Final = np.linspace(-1.0, 1.0, 9)
 """Positions across an edge at which the picture is sampled, relative to the reach."""
 _WEIGHTS: Final = np.array([0.125, *([0.25] * 7), 0.125])
 """Weights of the trapezoid rule for the positions ``_TAPS``."""
 _CLEARANCE: Final = 0.45
-"""Sampled share of the distance to the nearest parallel edge."""
+"""Largest reach, as a share of the distance to the nearest parallel edge."""
 _MIN_REACH: Final = 1.0
-"""Smallest reach in pixels; an edge with less is not measured, because neighbouring edges would blur into it."""
+"""Smallest reach in pixels. An edge whose reach would be smaller is not measured, because the blur of neighbouring
+edges overlaps it."""
 _CONTRAST: Final = 0.3
 """Smallest contrast of an edge, relative to the median contrast."""
 _LEAST_CONTRAST: Final = 1e-4
 """Smallest contrast of an edge in linear radiance."""
 _MIN_EDGES: Final = 16
-"""Smallest number of measured edge points: nine unknowns, and redundancy for outlier rejection."""
+"""Smallest number of measured edge points: nine unknowns, and redundancy for the rejection of outliers."""
 _DONE: Final = 0.05
-"""Displacement of edges, pixels, below which a Gauss-Newton step is the last; the next would move about a tenth."""
+"""Displacement of edges in pixels below which a Gauss-Newton step is the last. Another step would move the edges about
+a tenth as far."""
 _PRIOR: Final = np.diag([0.0] * 6 + [1.0] * 3)
-"""Prior on the three shift parameters, which are a fraction of a pixel: without it, a print without inner edges could
-not separate shift from distance."""
+"""Regularisation of the least squares: the squares of the three shift parameters, in pixels, are added to the sum of
+squared residuals. Otherwise shift and distance of a print without inner edges could not be separated."""
 _TUKEY: Final = 4.7
 """Residual in standard deviations beyond which an edge has weight 0, for example a covered edge or a reflection."""
 _MIN_CELLS: Final = 8
-"""Smallest number of visible cells that identify a pattern."""
+"""Smallest number of visible cells for the correlation of their brightness with the print."""
 _NEAR: Final = 1e-6
-"""Smallest distance from the camera, metres."""
+"""Smallest z of a point in the camera's frame, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,36 +61,40 @@ class Fit:
     """Pose measured in one frame, with its uncertainty."""
 
     pose: Pose
+    """``camera_from_world``."""
     information: Array
     """Inverse covariance, (6, 6), of rotation vector and translation around the pose."""
     error: float
-    """Root mean square residual in pixels."""
+    """Root mean square residual in pixels, weighted."""
     support: float
-    """Share of the printed edges that agree with the pose, 0 to 1."""
+    """Share of the printed edges that agree with the pose, 0 to 1: the sum of the weights per edge point."""
     cost: float
-    """Robust mean squared residual in pixels squared."""
+    """Mean squared residual in pixels squared; for edges, each square is at most 1."""
     pattern: float
-    """Correlation of the cells' brightness with the print."""
+    """Correlation of the cells' brightness with the print, -1 to 1."""
     edges: bool = True
     """True if the pose is fitted to edges; False if only to detected corners."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Solution:
-    """Solution of the edges' equations by reweighted least squares."""
+    """Solution of the edge points' equations by reweighted least squares."""
 
     step: Array
     """Update of rotation vector and translation, (6,)."""
     information: Array
     """Inverse covariance of the update, (6, 6), with the shift parameters eliminated."""
     residuals: Array
+    """Residuals of the equations in pixels, (n,)."""
     weights: Array
+    """Weights of the equations, 0 to 1, (n,)."""
 
 
 class EdgeFitter:
-    """Fitter of one print's pose to pictures of one camera; keeps the grey version of the current part of a picture.
+    """Fitter of one print's pose to pictures of one camera.
 
-    ``gray`` has the size of the whole picture; only the part given to ``show`` is valid.
+    ``gray`` holds the current picture in grey. It has the size of the whole picture, but only the part given to
+    ``show`` is valid.
     """
 
     def __init__(self, pattern: Pattern, camera: Camera) -> None:
@@ -102,7 +112,7 @@ class EdgeFitter:
         self._box: Box = slice(0, camera.height), slice(0, camera.width)
 
     def show(self, image: Image, box: Box) -> Image:
-        """Set the part of a picture that is used for fitting.
+        """Set the picture, and the part of it that is used for fitting.
 
         Args:
             image: uint8 (height, width, 3) RGB, or (height, width) grey.
@@ -120,7 +130,7 @@ class EdgeFitter:
         return part
 
     def project(self, points: Array) -> tuple[Array, Array]:
-        """Return pixels (n, 2) of camera points (n, 3), and their derivatives (n, 2, 3) by these points."""
+        """Return the pixels, (n, 2), of points in the camera's frame, (n, 3), and their derivatives, (n, 2, 3)."""
         # With identity pose, OpenCV's derivative by the translation equals the derivative by the point.
         zero = np.zeros(3)
         pixels, jacobian = cv2.projectPoints(points, zero, zero, self._matrix, self._distortion)
@@ -131,7 +141,7 @@ class EdgeFitter:
 
         Args:
             pose: Initial ``camera_from_world``.
-            reaches: Half width in pixels of the sampled window, for each Gauss-Newton step.
+            reaches: Largest reach in pixels of each Gauss-Newton step, in decreasing order.
         """
         solved: _Solution | None = None
         for reach in reaches:
@@ -158,9 +168,9 @@ class EdgeFitter:
         )
 
     def correlate(self, pose: Pose) -> float:
-        """Return the correlation, -1 to 1, of the brightness at cell centres with the print.
+        """Return the correlation, -1 to 1, of the brightness at the cells' centres with the print under a pose.
 
-        0 if too few cells are visible.
+        The result is 0 if too few cells are visible.
         """
         points = pose.apply(self._pattern.cells)
         if points[:, 2].min() <= _NEAR:
@@ -170,7 +180,7 @@ class EdgeFitter:
         if inside.sum() < _MIN_CELLS:
             return 0.0
         values = self._sample(at[inside])
-        # Clipping limits the influence of reflections of lamps.
+        # Clamping to percentiles limits the influence of lamps' reflections.
         values = np.clip(values, *np.percentile(values, (5, 95)))
         white = self._pattern.white[inside]
         a, b = values - values.mean(), white - white.mean()
@@ -178,7 +188,12 @@ class EdgeFitter:
         return float(a @ b) / scale if scale > 1e-9 else 0.0
 
     def _holds(self, low: Array, high: Array) -> NDArray[np.bool_]:
-        """Return a mask, (n,), of pixel pairs whose bounding box lies in the part given to ``show``."""
+        """Return a mask, (n,), of pixel pairs whose bounding box lies in the part given to ``show``.
+
+        Args:
+            low: One pixel of each pair, (n, 2).
+            high: The other pixel of each pair, (n, 2).
+        """
         rows, columns = self._box
         begins, ends = (columns.start, rows.start), (columns.stop - 1, rows.stop - 1)
         return np.asarray((low >= begins).all(axis=-1) & (high <= ends).all(axis=-1))
@@ -197,9 +212,15 @@ class EdgeFitter:
         return np.asarray(upper + below * (lower - upper), np.float64)
 
     def _measure(self, pose: Pose, reach: float) -> tuple[Array, Array] | None:
-        """Return one equation per visible edge point, (n, 9), and the point's offset in pixels, (n,).
+        """Return a linear equation for each visible edge point; None if too few are visible.
 
-        The nine columns are rotation vector, translation and the three shift parameters.
+        Args:
+            pose: ``camera_from_world`` from which the edges are measured.
+            reach: Largest reach in pixels.
+
+        Returns:
+            Coefficients of rotation vector, translation and the three shift parameters, (n, 9); and the offset of each
+            measured edge from its predicted place toward the white side, pixels, (n,).
         """
         pattern, turn = self._pattern, pose.rotation.T
         arm = pattern.points @ turn
@@ -235,7 +256,12 @@ class EdgeFitter:
 
 
 def _solve(design: Array, offsets: Array) -> _Solution | None:
-    """Return the reweighted least-squares solution; None if there is none."""
+    """Return the solution by least squares with Tukey's weights, updated three times; None if there is none.
+
+    Args:
+        design: Coefficients of the equations, (n, 9).
+        offsets: Right sides of the equations, pixels, (n,).
+    """
     weights = np.ones(len(design))
     for _ in range(3):
         weighted = weights[:, None] * design

@@ -1,6 +1,7 @@
 """Markers and boards: dictionaries by name, detection in a picture, and the geometry of the print.
 
-The print is described by its cells and by the borders between black and white cells.
+A print is described by its cells (the black and white squares of its markers) and by the borders between black and
+white.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _WINDOWS = (7, 23)
-"""Widths in pixels of the two adaptive thresholds: for sharp small markers, and for large or blurred markers."""
+"""Widths in pixels of the windows of two adaptive thresholds: for sharp small markers, and for large or blurred
+ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Detection:
     id: int
     """Id in its dictionary."""
     corners: NDArray[np.float32]
-    """Corners, (4, 2) pixels, clockwise from the marker's own top left."""
+    """Corners, (4, 2) pixels, clockwise from the corner that is printed at the marker's top left."""
 
 
 def find_dictionary(name: str) -> Any:
@@ -51,7 +53,7 @@ def tell_upright(scene: Scene) -> str:
 
 
 def make_board(marker: Marker) -> Any:
-    """Return OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, with y down."""
+    """Return OpenCV's board object for a marker with ``board`` set; its origin is the top left corner, with y down."""
     board = marker.board
     assert board is not None
     dictionary = find_dictionary(marker.dictionary)
@@ -72,15 +74,15 @@ class MarkerDetector:
         parameters = cv2.aruco.DetectorParameters()
         parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = _WINDOWS
         parameters.adaptiveThreshWinSizeStep = _WINDOWS[1] - _WINDOWS[0]
-        # Settings: bits are read from the middle of cells at twice OpenCV's resolution, and markers at the border are
-        # accepted. On a real clip of 145 frames with six markers, 119 frames show all six (95 with OpenCV's defaults)
-        # and there are no false detections.
+        # Bits are read from the middle of the cells at twice OpenCV's resolution, and markers at the picture's border
+        # are accepted. In a real clip of 145 frames with six markers, all six are found in 119 frames (in 95 with
+        # OpenCV's defaults), without false detections.
         parameters.perspectiveRemovePixelPerCell = 8
         parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
         parameters.minDistanceToBorder = 0
-        # Root mean square error per coordinate against path-traced poses: 0.65 pixel unrefined, 0.75 by contour lines,
-        # 0.28 by gradients (used here); AprilTag's quads have an offset of 0.45 pixel in x and y. The edge fit refines
-        # this further.
+        # Corners have a root mean square error per coordinate of 0.65 pixel unrefined, 0.75 refined by contour lines
+        # and 0.28 refined by gradients (used here), measured on path-traced pictures with known poses. Corners of
+        # AprilTag's quads are off by 0.45 pixel in x and y. The edge fit refines the pose further.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._parameters = parameters
         self._detector = cv2.aruco.ArucoDetector(find_dictionary(dictionary), parameters)
@@ -89,13 +91,13 @@ class MarkerDetector:
         """Return the markers in a uint8 (h, w) image, in OpenCV's order.
 
         Args:
-            gray: the image.
-            smallest: mean edge length in pixels of the smallest marker of interest; a larger value saves most of the
-                time.
+            gray: The image.
+            smallest: Mean side length in pixels of the smallest marker that must be found. A large value saves most of
+                the time.
             sharp: True to use the narrow threshold only, which takes half the time but misses blurred markers.
         """
         self._parameters.adaptiveThreshWinSizeMax = _WINDOWS[0 if sharp else 1]
-        # OpenCV takes the size relative to the longer image side.
+        # OpenCV expects the perimeter relative to the longer image side.
         self._parameters.minMarkerPerimeterRate = 4 * smallest / max(gray.shape)
         self._detector.setDetectorParameters(self._parameters)
         corners, ids, _ = self._detector.detectMarkers(gray)
@@ -109,7 +111,7 @@ class MarkerDetector:
 
 @dataclasses.dataclass(frozen=True)
 class Pattern:
-    """Geometry of a print in its marker's frame, metres: m edge points, c cells."""
+    """Geometry of a print in its marker's frame, in metres, with m points on borders and c cells."""
 
     markers: dict[int, Array]
     """Corners (4, 3) of each marker by its id, clockwise from top left."""
@@ -122,7 +124,7 @@ class Pattern:
     normals: Array
     """Unit direction toward the white side at each point, (m, 3)."""
     clearances: Array
-    """Distance in metres to the nearest parallel border, (m,)."""
+    """Distance in metres from each point to the nearest parallel border, (m,)."""
     cells: Array
     """Centres of the cells, (c, 3)."""
     white: Array
@@ -132,9 +134,17 @@ class Pattern:
 def _cell_edges(
     cells: NDArray[np.bool_], left: float, top: float, size: float, clearance: float
 ) -> list[tuple[float, ...]]:
-    """Return a row for each border between black and white cells.
+    """Return the borders between black and white cells of a grid.
 
-    A row holds middle (x, y), tangent, normal toward white, length and clearance.
+    Args:
+        cells: Mask of white cells, (rows, columns).
+        left: x of the grid's left side, metres.
+        top: y of the grid's upper side, metres.
+        size: Side of a cell, metres.
+        clearance: Distance from each border to the nearest parallel one, metres.
+
+    Returns:
+        For each border: middle (x, y), unit tangent (x, y), unit normal toward white (x, y), length and clearance.
     """
     edges: list[tuple[float, ...]] = []
     for row, column in np.argwhere(cells[:, 1:] != cells[:, :-1]):
@@ -150,9 +160,9 @@ def _edge_points(edges: Array) -> tuple[Array, Array, Array, Array]:
     """Return points on borders with their tangents and normals, (m, 3) each, and clearances, (m,).
 
     Args:
-        edges: Rows in the form of ``_cell_edges``, (n, 8).
+        edges: Borders as returned by ``_cell_edges``, (n, 8).
     """
-    # Only inner points of a border: at its ends, the blur of another border interferes.
+    # Points lie in the middle part of a border, because the blur of other borders interferes at its ends.
     count = int(np.clip(240 // len(edges), 1, 4))
     along = np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)
     edges = np.repeat(edges[:: -(-len(edges) // 300)], count, axis=0)
@@ -179,7 +189,7 @@ def pattern_of(marker: Marker) -> Pattern:
             for number, corners in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True)
         }
         if isinstance(board, CharucoBoard):
-            # The top left square is black, except for boards with an even number of rows in OpenCV's layout before 4.6.
+            # The top left square is black, except in OpenCV's layout before 4.6 with an even number of rows.
             first = int(board.legacy and board.rows % 2 == 0)
             squares = (np.add.outer(np.arange(board.rows), np.arange(board.columns) + first) % 2).astype(bool)
             square = board.square_length
@@ -201,7 +211,7 @@ def pattern_of(marker: Marker) -> Pattern:
         white.append(pattern[1:-1, 1:-1].ravel())
     points, tangents, normals, clearances = _edge_points(np.array(edges, float))
     corners = {n: _square(x + size / 2, y - size / 2, size, size) for n, (x, y) in places.items()}
-    turned = np.round(rotation_matrix((0.0, 0.0, turn))).T  # of rows
+    turned = np.round(rotation_matrix((0.0, 0.0, turn))).T  # transposed, because each row of the arrays is a point
     return Pattern(
         markers={number: square @ turned for number, square in corners.items()},
         outline=_square(0.0, 0.0, *((width, height) if turn % 180 == 0 else (height, width))),
@@ -215,7 +225,7 @@ def pattern_of(marker: Marker) -> Pattern:
 
 
 def printed_cells(marker: Marker) -> tuple[Array, NDArray[np.bool_], float, Array]:
-    """Return all cells of a print.
+    """Return all cells of a print's markers.
 
     Args:
         marker: Marker or board.

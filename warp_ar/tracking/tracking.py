@@ -7,19 +7,20 @@ are x right, y down and z forward, and pixel centres have integer coordinates.
 Detection gives four corners with an error of about 0.3 pixel, which is 0.25 degrees for a marker of 90 pixels. The
 printed pattern contains far more information: every border between a black and a white cell is a line at a known place.
 Refinement therefore moves the pose until those borders coincide with edges in the image [HS90], by Gauss-Newton with a
-redescending weight. Along a border's normal, the image is sampled in linear radiance over a window of half width h. The
-offset e of an edge from black b to white w follows, independent of its blur, from the area:
+redescending weight. Across each border, the radiance I(u) is sampled at distances u from the predicted border, over a
+window [-h, h]. Let b and w be the radiance on the black and on the white side. The offset e of the edge from the
+predicted border does not depend on the edge's blur:
 
     e = (1 / (w - b)) * integral of (w - I(u)) du over [-h, h], minus h
 
-No derivative of the image is taken, so noise averages out. Some effects shift all edges toward white or black and are
-not motion: clipped white, an inaccurate transfer curve, ink that spreads. Motion blur shifts edges depending on their
-direction. The shift of an edge with normal n in the picture is therefore modelled as n'Sn, with the three numbers of
-the symmetric matrix S unknown.
+No derivative of the image is taken, so noise averages out. Some effects shift all edges toward white or black although
+nothing moves: clipped white, an inaccurate transfer function, ink that spreads. Motion blur shifts edges depending on
+their direction. The shift of an edge with normal n in the picture is therefore modelled as n'Sn, where the three
+numbers of the symmetric matrix S are unknown.
 
 Objects, lights, proxies and mirror balls may be attached to markers of their own, which are tracked like the world's
-marker. A marker's pose in the world follows from the camera's poses relative to both: world_from_marker =
-world_from_camera camera_from_marker. Poses that a scene gives apply to the frames that it names.
+marker. A marker's pose in the world follows from the camera's pose relative to both: world_from_marker =
+world_from_camera camera_from_marker. A scene may give the camera's poses instead; a frame without one counts as lost.
 
 References:
     [HS90] C. Harris and C. Stennett. RAPID, a video rate object tracker. BMVC 1990.
@@ -53,30 +54,30 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _ENVIRONMENT = 0.6
-"""Half width of the search region beyond the last outline of the marker, in marker sizes."""
+"""Margin of the search region around the marker's predicted outline, relative to the outline's longer side."""
 
 _CLOSE = 0.25
-"""Half width of the first search region for a sharp marker: half the pixels, with the same detection result."""
+"""Margin of the first search region for a sharp marker. The region has half the pixels; detections are the same."""
 
 _INSIDE = 12.0
-"""Smallest distance in pixels of a marker's corners from the border of that region, because edges are sampled beyond
-them."""
+"""Smallest distance in pixels of a marker's corners from the border of the first search region, because edges are
+sampled beyond the corners."""
 
 _BEFORE = np.array([3, 0, 1, 2])
 """Index of the corner before each corner of a marker."""
 
 _NEAR = 0.5
-"""Largest distance of a detection from its expected place, relative to the smallest expected size, at which no other
-search is made."""
+"""Largest mean distance between detected and predicted corners at which the search ends, relative to the size returned
+by ``_smallest``."""
 
 _SHARP_AGAIN = 8
-"""Number of frames after which a blurred marker is searched for as a sharp one again."""
+"""Number of frames for which the search for a sharp marker is skipped after it has failed."""
 
 _REACH = (4.0, 3.0, 2.5, 2.5)
-"""Half width of the sampled window in pixels, per Gauss-Newton step; narrow cells limit it further."""
+"""Largest half width in pixels of the window sampled across an edge, per Gauss-Newton step; narrow cells reduce it."""
 
 _LOST_REACH = (9.0, 6.0, 4.0, 3.0, 2.5)
-"""Half width of the sampled window in pixels if the pose is only predicted from earlier frames."""
+"""Largest half width in pixels of the window if the pose is only predicted from earlier frames."""
 
 _CORNER_NOISE = 0.5
 """Standard deviation in pixels of a detected corner, for markers too small for edge refinement."""
@@ -91,10 +92,11 @@ _ENOUGH = 0.7
 """Share of a board's edges that must agree to skip detection."""
 
 _ALIKE = 3.0
-"""Ratio of reprojection errors below which the second pose of a plane is examined as well as the first."""
+"""Ratio of reprojection errors below which the second pose of a plane is examined as well as the first. Four corners of
+a plane fit two poses about equally well if the plane is far away."""
 
 _ALIKE_PIXELS = 0.5
-"""Difference of reprojection errors in pixels below which the second pose is examined as well."""
+"""Difference of reprojection errors in pixels below which the second pose is examined, whatever the ratio."""
 
 _FLIP_EVIDENCE = 12.0
 """Accumulated log likelihood that is needed to switch between the two poses of a plane."""
@@ -103,10 +105,11 @@ _FRAME_EVIDENCE = 4.0
 """Largest contribution of one frame to that log likelihood, so that a single bad frame cannot switch the pose."""
 
 _SETTLE = 9.0
-"""Squared deviation (in standard deviations, per degree of freedom) at which half of an innovation is applied."""
+"""Squared deviation, in standard deviations and per degree of freedom, between the measured and the last pose at which
+the smoothed pose moves half the way."""
 
 _FORGET = 0.4
-"""Time in seconds in which the smoothed pose forgets at least 1 - 1/e of earlier measurements."""
+"""Time constant in seconds of the smoothing: after it, earlier measurements have at most the weight 1/e."""
 
 
 class TrackState(enum.Enum):
@@ -129,8 +132,8 @@ class Track:
     state: TrackState
     """Origin of the pose."""
     quality: float
-    """Share of the printed edges that support the pose, 0 to 1, reduced by its uncertainty (1 degree or 1 % of distance
-    halve it)."""
+    """Quality of the pose, 0 to 1: the share of the printed edges that support it, reduced by its uncertainty. A
+    standard deviation of 1 degree, or of 1 % of the distance, halves it."""
     corners: NDArray[np.float32] | None
     """Corners of the marker or board in the image under ``pose``, (4, 2) pixels, clockwise from the page's top left;
     None when lost."""
@@ -144,7 +147,7 @@ def _rotation(vector: Array) -> Array:
 
 
 def _log(rotation: Array) -> Array:
-    """Return the rotation vector of a matrix, with length 0 to pi; unlike a quaternion it has no ambiguous sign."""
+    """Return the rotation vector of a rotation matrix, (3,), with length 0 to pi."""
     return np.asarray(cv2.Rodrigues(rotation)[0], float).ravel()
 
 
@@ -161,14 +164,14 @@ class Tracker:
     """Tracker of one marker or board over a sequence of frames.
 
     Args:
-        marker: the marker or board.
-        camera: the camera; its transfer curve matters little, because a common shift of all edges is estimated.
-        hold: seconds for which the pose is extrapolated after the last measurement.
-        steady: True to smooth the pose over time. The smoothed pose deviates from the measured one by about the
-            measurement's uncertainty at most: a static marker does not jitter, a moving one does not lag.
+        marker: The marker or board.
+        camera: The camera. Its transfer function matters little, because a common shift of all edges is estimated.
+        hold: Time in seconds for which the pose is extrapolated after the last measurement.
+        steady: True to smooth the pose over time. The smoothed pose deviates from the measured one by little more than
+            the measurement's uncertainty: a static marker does not jitter, a moving one does not lag.
 
     Raises:
-        UsageError: if the marker does not exist, an argument is of another type, or ``hold`` below 0.
+        UsageError: The marker does not exist, an argument has another type, or ``hold`` is below 0.
     """
 
     @checked
@@ -199,16 +202,16 @@ class Tracker:
 
         Args:
             image: uint8 (height, width, 3) RGB, or (height, width) grey.
-            time: seconds, growing from frame to frame.
+            time: Time in seconds, increasing from frame to frame.
 
         Raises:
-            UsageError: if the image is not of the camera's size and 8-bit.
+            UsageError: The image does not have the camera's size, or is not 8-bit.
         """
         if image.dtype != np.uint8 or image.shape[:2] != self._shape or image.shape[2:] not in ((), (3,)):
             h, w = self._shape
             raise UsageError(f"image: {image.dtype} {image.shape} should be uint8 ({h}, {w}, 3), the camera's size")
         if not 0 <= time - self._time <= self._hold:
-            self.reset()  # too long ago to predict, or a clock that ran backwards
+            self.reset()  # the last measurement is too old for a prediction, or time went backwards
         guess = self._predict(time)
         fit = self._measure(image, guess)
         if fit is None:
@@ -228,14 +231,14 @@ class Tracker:
         return self._detect(image)
 
     def error_of(self, image: Image, found: list[Detection]) -> float:
-        """Return how well the print fits at its detections, without earlier frames.
+        """Return the reprojection error of a pose fitted to detections in one image, without earlier frames.
 
         Args:
-            image: As in ``track``.
+            image: uint8 (height, width, 3) RGB, or (height, width) grey.
             found: Result of ``detect`` for the image, by any tracker of this marker.
 
         Returns:
-            The reprojection error that ``track`` of a new tracker would give, in pixels; infinite if no pose fits.
+            The root mean square error in pixels; infinite if no pose fits.
         """
         self._show(image)
         fit = self._fit_detections(found, None)
@@ -248,9 +251,9 @@ class Tracker:
         return Track(guess, TrackState.HELD, float(np.clip(quality, 0, 1)), self._outline(guess), np.inf)
 
     def _predict(self, time: float) -> Pose | None:
-        """Return the last pose extrapolated to a time.
+        """Return the last pose extrapolated to a time; None without a last pose.
 
-        The velocity halves over the hold time, so that a lost marker stays near.
+        The velocity halves within the hold time, so that the pose of a hidden marker does not move far.
         """
         if self._pose is None:
             return None
@@ -263,12 +266,16 @@ class Tracker:
         return self._fitter.project(pose.apply(self._pattern.outline))[0].astype(np.float32)
 
     def _measure(self, image: Image, guess: Pose | None) -> Fit | None:
-        """Return the pose measured in this image alone.
+        """Return the pose measured in this image alone; None if the marker is not found.
 
-        ``guess`` only limits the search and resolves the ambiguity of a plane.
+        Args:
+            image: uint8 RGB or grey.
+            guess: Predicted pose, if any. It limits the search, is the start of the fit where detection fails, and
+                selects one of the two poses of a plane.
         """
         if guess is not None:
-            # A board has no ambiguous second pose, and decoding its many markers is slow: its edges are tried first.
+            # The edges of a board are tried before detection: decoding its many markers is slow, and a board has no
+            # ambiguous second pose.
             if len(self._pattern.markers) > 1:
                 self._show(image, self._around(self._outline(guess)))
                 fit = self._fit_guess(guess)
@@ -276,8 +283,7 @@ class Tracker:
                     return fit
             fit = self._fit_detections(self._find_expected(image, guess), guess)
             if fit is None or not fit.edges:
-                # The marker may be partly hidden or cut off, with missing or wrong corners; its edges may still be
-                # visible.
+                # Corners of a marker may be hidden or outside the picture while enough of its edges are visible.
                 self._show(image, self._around(self._outline(guess)))
                 fit = self._fit_guess(guess) or fit
             if fit is not None:
@@ -287,16 +293,22 @@ class Tracker:
         fit = self._fit_detections(found, guess)
         if fit is None or not fit.edges or self._rival or len(self._pattern.markers) > 1:
             return fit
-        # Measured again as in the next frame, so that a static marker does not move from the first frame to the second.
+        # The measurement is repeated in the same way as in the next frame, so that a static marker does not move from
+        # the first frame to the second.
         return self._fit_detections(self._find_expected(image, fit.pose), fit.pose) or fit
 
     def _show(self, image: Image, box: Box | None = None) -> Image:
-        """Return a part of the image in grey (default: the whole image) as the input of detection and fitting."""
+        """Set the part of an image for fitting (default: the whole image), and return it in grey."""
         h, w = self._shape
         return self._fitter.show(image, (slice(0, h), slice(0, w)) if box is None else box)
 
     def _around(self, outline: NDArray[np.float32], environment: float = _ENVIRONMENT) -> Box:
-        """Return rows and columns of the image around a marker's outline; never empty."""
+        """Return the rows and columns of the image around a marker's outline; never empty.
+
+        Args:
+            outline: Corners of the outline, (4, 2) pixels.
+            environment: Margin relative to the outline's longer side; 16 pixels are added to it.
+        """
         low, high = outline.min(0), outline.max(0)
         environment = environment * float((high - low).max()) + 16
         h, w = self._shape
@@ -304,19 +316,21 @@ class Tracker:
         return slice(int(y0), int(np.ceil(y1))), slice(int(x0), int(np.ceil(x1)))
 
     def _smallest(self, guess: Pose) -> float:
-        """Return the smallest edge length in pixels of a marker expected at ``guess``."""
+        """Return a lower bound in pixels on the side length of markers, for detection.
+
+        It is 0.6 times the mean side length of the smallest marker of the print under the predicted pose ``guess``.
+        """
         corners = np.concatenate([guess.apply(c) for c in self._pattern.markers.values()])
         pixels = self._fitter.project(corners)[0].reshape(-1, 4, 2)
         sides = pixels - pixels[:, _BEFORE]
         return 0.6 * float(np.sqrt((sides**2).sum(axis=2)).mean(axis=1).min())
 
     def _find_expected(self, image: Image, guess: Pose) -> list[Detection]:
-        """Detect the markers where they are expected.
+        """Detect the markers near their places under the predicted pose ``guess``.
 
-        A single marker that was sharp recently is first searched for as sharp.
-
-        A marker found with the narrow threshold has the same corners as with both; a marker that is not found may be
-        blurred.
+        A single marker is first searched for with the narrow threshold alone, which finds the same corners of a sharp
+        marker in less time. If that fails, the marker may be blurred. Both thresholds are then used for
+        ``_SHARP_AGAIN`` searches.
         """
         smallest, expected = self._smallest(guess), self._outline(guess)
         if len(self._pattern.markers) == 1 and self._blurred == 0:
@@ -333,9 +347,16 @@ class Tracker:
     def _detect(
         self, image: Image, box: Box | None = None, smallest: float = 10.0, *, sharp: bool = False
     ) -> list[Detection]:
-        """Detect the markers in a part of the image (default: the whole image).
+        """Detect the markers of the print in a part of the image (default: the whole image).
 
-        Corners are in pixels of the whole image.
+        Args:
+            image: uint8 RGB or grey.
+            box: Rows and columns of the part.
+            smallest: Mean side length in pixels of the smallest marker that must be found.
+            sharp: True to use the narrow threshold only.
+
+        Returns:
+            Detections, with corners in pixels of the whole image.
         """
         detected = self._detector.detect(self._show(image, box), max(smallest, 10.0), sharp=sharp)
         origin = np.array((0, 0) if box is None else (box[1].start, box[0].start), np.float32)
@@ -357,7 +378,7 @@ class Tracker:
         return self._preferred(good, guess) if good else None
 
     def _chosen(self, found: list[Detection], guess: Pose | None) -> list[Detection]:
-        """Return one detection per id: the nearest to its expected place, or without expectation the largest."""
+        """Return one detection per id: the one nearest to its predicted place, or without a prediction the largest."""
         if len(found) < 2:
             return found
 
@@ -373,9 +394,16 @@ class Tracker:
         return list(best.values())
 
     def _plane_poses(self, points: Array, corners: Array) -> list[tuple[Pose, float]]:
-        """Return both poses of a plane [CB14], with reprojection errors in pixels, the better one first.
+        """Return the two poses of a plane that fit its corners [CB14], the better one first.
 
-        With clockwise corners, z points toward the camera in both poses.
+        With clockwise corners, z points toward the camera in both poses. Poses behind the camera are left out.
+
+        Args:
+            points: Corners in the marker's frame, (n, 3).
+            corners: Corners in the image, (n, 2) pixels.
+
+        Returns:
+            Poses with their root mean square reprojection errors in pixels.
         """
         # With z into the page, a marker seen frontally has the identity rotation. With z out of the page, it is rotated
         # by exactly half a turn, where OpenCV's solver divides 0 by 0 and returns a pose that is off by 160 pixels.
@@ -397,7 +425,11 @@ class Tracker:
         return sorted(poses, key=lambda p: p[1])
 
     def _preferred(self, fits: list[Fit], guess: Pose | None) -> Fit:
-        """Return one of the two poses of a plane: the better in this frame, unless earlier frames support the other."""
+        """Return one of the two poses of a plane.
+
+        This is the pose nearer to the prediction ``guess``, until the accumulated evidence for the other pose exceeds
+        ``_FLIP_EVIDENCE``. Without a prediction, it is the pose with the smaller residuals.
+        """
         if guess is None or len(fits) < 2:
             self._evidence = 0.0
             return min(fits, key=lambda f: f.cost)
@@ -412,12 +444,18 @@ class Tracker:
         return far
 
     def _refined(self, poses: list[Pose], points: Array, corners: Array) -> list[Fit]:
-        """Return poses fitted to the edges, or to the corners if the edges are too small to measure."""
+        """Return each pose fitted to the edges, or to the corners if the fit to the edges fails."""
         found = [(pose, self._fitter.fit(pose, _REACH)) for pose in poses]
         return [fit if _holds(fit) else self._fit_corners(pose, points, corners) for pose, fit in found]
 
     def _fit_corners(self, pose: Pose, points: Array, corners: Array) -> Fit:
-        """Return the pose fitted to detected corners."""
+        """Return a pose that was computed from detected corners, with its uncertainty and error.
+
+        Args:
+            pose: The pose.
+            points: Corners in the marker's frame, (n, 3).
+            corners: Corners in the image, (n, 2) pixels.
+        """
         camera = pose.apply(points)
         pixels, jacobian = self._fitter.project(camera)
         residual = pixels - corners
@@ -432,11 +470,11 @@ class Tracker:
         return fit if _holds(fit) else None
 
     def _steadied(self, fit: Fit, guess: Pose | None, time: float) -> Pose:
-        """Return the measured pose, averaged with the last one as far as both agree within the measurement's noise.
+        """Return the measured pose averaged with the last one, in which the last one has little weight if they differ.
 
-        For an innovation x with information matrix L, s = x'Lx / 6 is 1 on average without motion. Applying the share s
-        / (s + c) of x leaves the error c x / (s + c), which is at most half of sqrt(c) standard deviations for any
-        motion.
+        Let x be the difference between measured and last pose, and L the information matrix of the measurement. Without
+        motion, s = x'Lx / 6 is about 1. The last pose is moved by the share s / (s + c) of x, with c = ``_SETTLE``. The
+        error that is left, c x / (s + c), is at most half of sqrt(c) standard deviations for any motion.
         """
         if self._pose is None or guess is None or not self._steady:
             return fit.pose
@@ -446,7 +484,10 @@ class Tracker:
         return _moved(self._pose, share * step)
 
     def _judge(self, fit: Fit) -> float:
-        """Return the quality of a pose, by its support and its uncertainty."""
+        """Return the quality of a pose, 0 to 1, from its support and its uncertainty.
+
+        It is halved if the last detection in a whole picture found two markers with one id.
+        """
         variances = [max(value, 0.0) for value in _inverse(fit.information).diagonal().tolist()]
         turn = math.degrees(math.sqrt(sum(variances[:3])))
         shift = 100.0 * math.sqrt(sum(variances[3:])) / math.hypot(*fit.pose.translation.tolist())
@@ -455,7 +496,7 @@ class Tracker:
 
 
 def _inverse(information: Array) -> Array:
-    """Return the covariance of a pose; unobservable motions are left out."""
+    """Return the covariance, (6, 6), of a pose with an information matrix; unobservable motions have variance 0."""
     with contextlib.suppress(np.linalg.LinAlgError):
         inverse = np.asarray(np.linalg.inv(information), float)
         if inverse.diagonal().min() > 0.0:
@@ -464,7 +505,7 @@ def _inverse(information: Array) -> Array:
 
 
 def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
-    """Return True if corners lie inside a part of the image with a margin."""
+    """Return True if corners, (4, 2) pixels, lie at least ``_INSIDE`` pixels inside a part of the image."""
     rows, columns = box
     low, high = corners.min(0), corners.max(0)
     return bool(
@@ -478,12 +519,14 @@ def _holds(fit: Fit | None) -> TypeGuard[Fit]:
 
 
 def _pose_rows(jacobian: Array, arm: Array) -> Array:
-    """Return the derivative (n, 2, 6) of pixels with respect to a pose's rotation vector and translation.
+    """Return the derivative (n, 2, 6) of pixels with respect to a change of pose: rotation vector w and translation d.
 
-    ``arm`` is R X.
+    The change moves the camera point R X + t to exp(w) R X + t + d, which is a displacement of w x RX + d to first
+    order. A row j of the derivative by the camera point therefore becomes (RX x j, j).
 
-    exp(w) R X + t + d changes by w x RX + d. A row j of the derivative with respect to the point therefore becomes (RX
-    x j, j).
+    Args:
+        jacobian: Derivative of the pixels by the camera points, (n, 2, 3).
+        arm: R X, (n, 3).
     """
     x, y, z = arm.T[:, :, None]
     a, b, c = np.moveaxis(jacobian, 2, 0)
@@ -493,7 +536,7 @@ def _pose_rows(jacobian: Array, arm: Array) -> Array:
 
 
 Places = Mapping[Marker, Pose | None]
-"""``world_from_marker`` of each marker; None if it is lost."""
+"""``world_from_marker`` of each marker; None for a marker that is lost."""
 
 
 def own_markers(scene: Scene) -> tuple[Marker, ...]:
@@ -515,16 +558,16 @@ class OwnMarkers:
         self._trackers = {marker: Tracker(marker, camera) for marker in own_markers(scene)}
 
     def __bool__(self) -> bool:
-        """Return True if there are any."""
+        """Return True if any part of the scene is attached to a marker."""
         return bool(self._trackers)
 
     def track(self, image: NDArray[np.uint8], time: float, camera_from_world: Pose | None) -> Places:
-        """Return the markers' poses in the world; all are lost while the world's marker is.
+        """Return the markers' poses in the world; all are None while ``camera_from_world`` is unknown.
 
         Args:
-            image: (h, w, 3) RGB of 8 bits.
-            time: Seconds.
-            camera_from_world: Pose by the world's marker or from the scene; None if lost.
+            image: uint8 RGB, (height, width, 3).
+            time: Time of the frame, seconds.
+            camera_from_world: Pose of the camera by the world's marker or from the scene; None if unknown.
         """
         found = {marker: tracker.track(image, time).pose for marker, tracker in self._trackers.items()}
         if camera_from_world is None:
@@ -537,14 +580,14 @@ _NO_POSE = Track(None, TrackState.LOST, 0.0, None, math.inf)
 
 
 def given_pose(spec: PoseSpec | None, frame: Frame | int) -> Pose | Track | None:
-    """Return the given pose of a frame.
+    """Return the camera's pose that the scene gives for a frame.
 
     Args:
-        spec: The scene's poses, if it gives any.
+        spec: The scene's poses; None if it gives none.
         frame: The frame, or only its index.
 
     Returns:
-        The pose; a lost track if the file has no pose for the frame; None if the scene gives no poses.
+        The pose; a lost track if the scene gives none for this frame; None without ``spec``.
     """
     if spec is None:
         return None
@@ -553,7 +596,10 @@ def given_pose(spec: PoseSpec | None, frame: Frame | int) -> Pose | Track | None
 
 
 def tell_missing_poses(spec: PoseSpec | None, source: Source) -> str:
-    """Return a line with the number of frames without a pose; empty if all have one or the number is unknown."""
+    """Return a message on the frames for which a file of poses has none.
+
+    It is empty if all have one, or if the frames are not known in advance.
+    """
     if spec is None or spec.file is None or source.live:
         return ""
     frames = source.names or ("",) * (source.length or 0)
