@@ -163,18 +163,21 @@ def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera)
         camera: The camera of the frames.
     """
     rects = [EMPTY] * len(outlines)
-    parts = _join(tuple(outlines))
-    if parts is None:
+    parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
+    if not parts:
         return rects
-    points, starts, places = pose.apply(parts.corners), parts.starts, parts.places
-    nearest = points[:, 2].min()
-    # Depth range that is enough for most frames; else the points are tested one by one.
-    if nearest < 2e-6 * (parts.radius + float(np.abs(pose.translation).sum())) and nearest < _nearest(points):
-        clipped = {index: _in_front(outlines[index], pose) for index in places}
-        left = {index: part for index, part in clipped.items() if len(part)}
-        if not left:
+    points = pose.apply(np.concatenate(list(parts.values())))
+    near = 1e-6 * max(float(np.abs(points).max()), 1e-12)
+    if points[:, 2].min() < near:
+        forward = np.array([0.0, 0.0, 1.0])
+        for index in parts:
+            clipped = [_clip(pose.apply(polygon), forward, near) for polygon in outlines[index].polygons]
+            parts[index] = np.concatenate(clipped)
+        parts = {index: part for index, part in parts.items() if len(part)}
+        if not parts:
             return rects
-        points, starts, places = np.concatenate(list(left.values())), _starts(left.values()), tuple(left)
+        points = np.concatenate(list(parts.values()))
+    starts = list(itertools.accumulate(map(len, parts.values()), initial=0))[:-1]
     projected = points[:, :2] / points[:, 2:]
     low, high = np.minimum.reduceat(projected, starts), np.maximum.reduceat(projected, starts)
     x_low, x_high, y_low, y_high = _ray_bounds(camera)
@@ -184,52 +187,8 @@ def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera)
         x_high.searchsorted(low[:, 0]),
         x_low.searchsorted(high[:, 0], "right"),
     )
-    for index, rect in zip(places, zip(*(edge.tolist() for edge in edges), strict=True), strict=True):
+    for index, rect in zip(parts, zip(*(edge.tolist() for edge in edges), strict=True), strict=True):
         top, bottom, first, last = rect
         if top < bottom and first < last:
             rects[index] = rect
     return rects
-
-
-@dataclasses.dataclass(frozen=True)
-class _Joined:
-    """Corners of several outlines, concatenated."""
-
-    corners: FloatArray
-    """Corners of all outlines, (n, 3)."""
-    starts: list[int]
-    """Index of the first corner of each outline that has any."""
-    places: tuple[int, ...]
-    """Indices of the outlines that have corners."""
-    radius: float
-    """Largest distance of a corner from the origin."""
-
-
-@functools.lru_cache(maxsize=16)
-def _join(outlines: tuple[Outline, ...]) -> _Joined | None:
-    """Return the outlines concatenated; cached, because they stay the same over many frames."""
-    parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
-    if not parts:
-        return None
-    corners = np.concatenate(list(parts.values()))
-    radius = float(np.linalg.norm(corners, axis=1).max())
-    return _Joined(corners, _starts(parts.values()), tuple(parts), radius)
-
-
-def _starts(parts: Iterable[FloatArray]) -> list[int]:
-    return list(itertools.accumulate(map(len, parts), initial=0))[:-1]
-
-
-def _nearest(points: FloatArray) -> float:
-    """Return the near plane's depth, in the camera's frame, for clipping."""
-    return 1e-6 * max(float(np.abs(points).max()), 1e-12)
-
-
-def _in_front(outline: Outline, pose: Pose) -> FloatArray:
-    """Return the corners, in the camera's frame, of an outline clipped at the near plane."""
-    points = pose.apply(outline.corners)
-    near = _nearest(points)
-    if points[:, 2].min() >= near:
-        return points
-    forward = np.array([0.0, 0.0, 1.0])
-    return np.concatenate([_clip(pose.apply(polygon), forward, near) for polygon in outline.polygons])
