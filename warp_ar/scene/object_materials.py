@@ -24,7 +24,6 @@ from warp_ar.scene.materials import (
     EmissiveMaterial,
     FileMaterial,
     LambertMaterial,
-    Material,
     MeshMaterial,
     MetallicRoughnessMaterial,
     MirrorMaterial,
@@ -150,8 +149,7 @@ def moving_mesh_of(item: Object) -> MovingMesh | None:
 @functools.lru_cache(maxsize=8)
 def _read_moving(path: Path, stamp: tuple[int, int], animation: str | int) -> MovingMesh:
     moving = load_moving_mesh(path, animation)
-    if moving.rest.notes:
-        _say(path, moving.rest.notes)
+    _say(path, moving.rest.notes)
     return moving
 
 
@@ -167,14 +165,14 @@ def file_mesh(path: Path) -> Mesh:
 @functools.lru_cache(maxsize=4)
 def _read_mesh(path: Path, stamp: tuple[int, int]) -> Mesh:
     mesh = load_mesh(path)
-    if mesh.notes:
-        _say(path, mesh.notes)
+    _say(path, mesh.notes)
     return mesh
 
 
 @functools.cache
 def _say(path: Path, notes: tuple[str, ...]) -> None:
-    _LOG.warning("%s: not shown: %s", printable(path), printable(", ".join(notes)))
+    if notes:
+        _LOG.warning("%s: not shown: %s", printable(path), printable(", ".join(notes)))
 
 
 def materials_of(item: Object) -> ObjectMaterials:
@@ -257,34 +255,19 @@ def _is_black(color: Color) -> bool:
     return not isinstance(color, Path) and not any(color)
 
 
-def reflects_diffusely(material: MeshMaterial | Material) -> bool:
+def reflects_diffusely(material: MeshMaterial) -> bool:
     """Return True if a material reflects the environment's irradiance."""
-    surface: Any = material
-    least = 1.0
-    if isinstance(material, MeshMaterial):
-        if material.unlit:
-            return False
-        surface, least = material.surface, material.metallic_span[0]
-    match surface:
-        case LambertMaterial() | PhongMaterial():
-            return not _is_black(surface.base_color)
-        case MetallicRoughnessMaterial():
-            return least * surface.metallic < 1.0 and not _is_black(surface.base_color)
-    return isinstance(surface, FileMaterial)
+    surface: Any = material.surface
+    if material.unlit or isinstance(surface, MirrorMaterial):
+        return False
+    metallic = surface.metallic if isinstance(surface, MetallicRoughnessMaterial) else 0.0
+    return material.metallic_span[0] * metallic < 1.0 and not _is_black(surface.base_color)
 
 
-def reflects_glossily(material: MeshMaterial | Material) -> bool:
+def reflects_glossily(material: MeshMaterial) -> bool:
     """Return True if a material reflects the environment's prefiltered radiance."""
-    surface: Any = material
-    if isinstance(material, MeshMaterial):
-        if material.unlit:
-            return False
-        surface = material.surface
-    match surface:
-        case PhongMaterial():
-            return not _is_black(surface.specular)
-        case MirrorMaterial():
-            return not _is_black(surface.base_color)
-        case MetallicRoughnessMaterial():
-            return True
-    return False
+    surface: Any = material.surface
+    if material.unlit or isinstance(surface, LambertMaterial):
+        return False
+    color = surface.specular if isinstance(surface, PhongMaterial) else surface.base_color
+    return isinstance(surface, MetallicRoughnessMaterial) or not _is_black(color)
