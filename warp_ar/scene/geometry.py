@@ -26,6 +26,8 @@ ByteArray = npt.NDArray[np.uint8]
 # A triangle whose doubled area is below this share of its longest edge squared has no reliable normal: float32 vertices
 # on one line give 1e-16 in float64, and the thinnest sliver that float32 can represent gives 1e-7.
 _ZERO_AREA: Final = 1e-12
+_ROUNDING: Final = 1e-6
+"""Length of a sum of unit vectors up to which it is rounding error."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -145,7 +147,7 @@ def smooth_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> FloatArray:
         where = place[corners[solid, k]]
         fallback[where] = unit[solid]
         total += _sums(where, angle[solid, k, None] * unit[solid], count)
-    result: FloatArray = _unit_or(total, fallback)[place].astype(np.float32)
+    result: FloatArray = unit_or(total, fallback, _ROUNDING)[place].astype(np.float32)
     return result
 
 
@@ -166,13 +168,11 @@ def _sums(group: npt.NDArray[np.int64], values: npt.NDArray[Any], count: int) ->
     return np.stack([np.bincount(group, values[:, axis], count) for axis in range(3)], axis=-1)
 
 
-def _unit_or(vectors: npt.NDArray[Any], fallback: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the vectors normalized.
-
-    A vector shorter than 1e-6, which is rounding error, is replaced by its fallback.
-    """
+def unit_or(vectors: npt.NDArray[Any], other: npt.NDArray[Any] | float, least: float = 0.0) -> npt.NDArray[Any]:
+    """Return ``vectors``, (n, 3), normalized; one that is not longer than ``least`` is replaced by ``other``."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(length > 1e-6, vectors / np.maximum(length, 1e-6), fallback)
+    usable = np.isfinite(length) & (length > least)
+    return np.where(usable, vectors / np.where(usable, length, 1.0), other)
 
 
 def _places(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
@@ -224,7 +224,7 @@ def creased_normals(
     own = np.repeat(unit, 3, axis=0)
     total = _sums(group, angle.reshape(-1, 1) * own, 3 * len(corners))[group]
     fallback = np.where((own**2).sum(axis=1, keepdims=True) > 0.5, own, [0.0, 0.0, 1.0])
-    normals: FloatArray = _unit_or(total, fallback).astype(np.float32)
+    normals: FloatArray = unit_or(total, fallback, _ROUNDING).astype(np.float32)
     return corners.ravel(), normals
 
 
@@ -270,8 +270,7 @@ def tangent_frames(
     area = t1[:, 0] * t2[:, 1] - t2[:, 0] * t1[:, 1]
     side = np.where(area < 0.0, -1.0, 1.0)
     along = side[:, None] * (t2[:, 1:] * p1 - t1[:, 1:] * p2)
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    along = np.where((length > 0.0) & np.isfinite(length), along / np.where(length > 0.0, length, 1.0), 0.0)
+    along = unit_or(along, 0.0)
     along[area == 0.0] = 0.0
 
     _, angle, _ = _face_normals(points, corners)
@@ -281,5 +280,5 @@ def tangent_frames(
     flat = total - (total * normal).sum(axis=1, keepdims=True) * normal
     other = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.5, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
     other /= np.linalg.norm(other, axis=1, keepdims=True)
-    frames: FloatArray = np.concatenate([_unit_or(flat, other), np.repeat(side, 3)[:, None]], axis=1).astype(np.float32)
-    return corners.ravel(), frames
+    tangents = unit_or(flat, other, _ROUNDING)
+    return corners.ravel(), np.concatenate([tangents, np.repeat(side, 3)[:, None]], axis=1).astype(np.float32)

@@ -22,10 +22,10 @@ import numpy.typing as npt
 from warp_ar.errors import SceneError
 from warp_ar.files import limits, too_much
 from warp_ar.pictures import in_srgb, picture_size
-from warp_ar.scene.geometry import creased_normals
+from warp_ar.scene.geometry import creased_normals, unit_or
 from warp_ar.scene.gltf_file import GltfFile
 from warp_ar.scene.materials import IDENTITY, MeshMaterial, MetallicRoughnessMaterial, TextureUse, Wrap
-from warp_ar.scene.mesh_parts import LARGEST, MeshPart, strip_triangles, unit_or
+from warp_ar.scene.mesh_parts import LARGEST, MeshPart, strip_triangles
 from warp_ar.scene.mesh_source import MeshSource
 from warp_ar.scene.node_animation import INTERPOLATIONS, WIDTHS, Anchor, NodeTrack, Sampler, part_transforms
 from warp_ar.scene.polygon_files import CREASE, linear_rgba

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.geometry import Mesh, creased_normals, make_mesh, smooth_normals, tangent_frames
+from warp_ar.scene.geometry import Mesh, creased_normals, make_mesh, smooth_normals, tangent_frames, unit_or
 from warp_ar.scene.materials import LambertMaterial, MeshMaterial, TextureUse
 from warp_ar.scene.mesh_source import MeshSource
 
@@ -83,14 +83,9 @@ class MeshPart:
             part = cls(vertices, faces, np.zeros_like(vertices), uvs, colors, None, material)._taken(where)
             return dataclasses.replace(part, normals=computed.astype(np.float64))._with_tangents()
         smooth = smooth_normals(vertices, faces).astype(np.float64)
-        if normals is None:
-            normals = smooth
-        else:
-            with np.errstate(over="ignore", invalid="ignore"):
-                length = np.linalg.norm(normals, axis=1, keepdims=True)
-                usable = np.isfinite(length) & (length > 0.0)
-                normals = np.where(usable, normals / np.where(usable, length, 1.0), smooth)
-        return cls(vertices, faces, normals, uvs, colors, tangents, material)._with_tangents()
+        with np.errstate(over="ignore", invalid="ignore"):
+            unit = smooth if normals is None else unit_or(normals, smooth)
+        return cls(vertices, faces, unit, uvs, colors, tangents, material)._with_tangents()
 
     def _taken(self, where: npt.NDArray[np.int64]) -> MeshPart:
         """Return the triangles without shared vertices: corner k of face f copies vertex ``where[3 f + k]``."""
@@ -257,10 +252,3 @@ def _finite(values: Any, count: int, largest: float) -> Array | None:
     if values is None or len(values) != count or not (np.abs(values) < largest).all():
         return None
     return np.asarray(values, dtype=np.float64)
-
-
-def unit_or(vectors: Array, other: Array) -> Array:
-    """Return ``vectors``, (n, 3), normalized; a vector of length 0 is replaced by the one in ``other``."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    usable = np.isfinite(length) & (length > 0.0)
-    return np.where(usable, vectors / np.where(usable, length, 1.0), other)
