@@ -19,7 +19,7 @@ from tests.test_live import message, write_scene
 from warp_ar import export
 from warp_ar.output.environment_file import read_environment
 from warp_ar.output.gltf_file import write_glb
-from warp_ar.output.shot import Shot, exchange_materials_of, mesh_of, placement, texture_files
+from warp_ar.output.shot import Shot, mesh_of, placement, texture_files, used_materials
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
 from warp_ar.scene.description import Animation
@@ -368,7 +368,7 @@ def test_gltf_moves_camera_and_objects(shot, tmp_path):
 
 def test_a_phong_lobe_becomes_as_wide_a_one():
     item = Object("sphere", radius=0.1, material=PhongMaterial((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 30.0))
-    (material,) = exchange_materials_of(item, mesh_of(item))
+    (material,), _ = used_materials(item, mesh_of(item))
     assert (material.base_color, material.metallic, material.specular) == ((0.1, 0.2, 0.3), 0.0, (0.4, 0.5, 0.6))
     assert material.roughness == pytest.approx((2 / 32) ** 0.25)
     assert not material.pictures

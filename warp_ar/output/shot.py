@@ -18,13 +18,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.description import Light, Object, Proxy
-from warp_ar.scene.geometry import Mesh, make_mesh, rotation_matrix
+from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.materials import (
     RGB,
     Color,
@@ -36,16 +35,15 @@ from warp_ar.scene.materials import (
     PhongMaterial,
     TextureUse,
 )
-from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.object_materials import materials_of
 from warp_ar.scene.object_materials import mesh_of as object_mesh
 from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements, surface_names
-from warp_ar.scene.shapes import box_mesh, disk_mesh, sphere_mesh, torus_mesh, tube_mesh
-from warp_ar.scene.textures import load_emission, load_texture
+from warp_ar.scene.ray_mesh import make_mesh, mesh_key
+from warp_ar.scene.shapes import box_mesh, rect_mesh, sphere_mesh
+from warp_ar.scene.texture_pack import joint_picture
+from warp_ar.scene.textures import linear_texture, load_emission, load_texture
 from warp_ar.signature import encode_png
-from warp_ar.srgb import decode_srgb, encode_srgb
 
-Array = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.uint8]
 Matrix = npt.NDArray[np.float64]
 
@@ -96,11 +94,6 @@ class ExchangeMaterial:
     """The scene's material, for properties that all formats share: alpha, emission, factors of pictures."""
 
 
-def exchange_materials_of(item: Object, mesh: Mesh) -> tuple[ExchangeMaterial, ...]:
-    """Return the materials of an object's triangles, in the order of ``Mesh.materials``."""
-    return tuple(_exchange_material(item, mesh, material) for material in materials_of(item).materials)
-
-
 def _exchange_material(item: Object, mesh: Mesh, own: MeshMaterial) -> ExchangeMaterial:
     uses = {"": own.base, "emission": own.emissive}
     uses |= {name: getattr(own, name) for name in ("metallic_roughness", "normal", "occlusion")}
@@ -122,7 +115,7 @@ def _exchange_material(item: Object, mesh: Mesh, own: MeshMaterial) -> ExchangeM
     if isinstance(material, PhongMaterial):
         specular = _mean_color(material.specular)
         if own.specular is not None:
-            shown = to_linear(mesh.images[own.specular.image][..., :3]).mean(axis=(0, 1))
+            shown = linear_texture(mesh.images[own.specular.image][..., :3]).mean(axis=(0, 1), dtype=np.float64)
             specular = (specular[0] * shown[0], specular[1] * shown[1], specular[2] * shown[2])
         return ExchangeMaterial(factor, 0.0, (2.0 / (material.shininess + 2.0)) ** 0.25, specular, pictures, own)
     if isinstance(material, MetallicRoughnessMaterial):
@@ -136,28 +129,18 @@ def _colored(color: Color, base: Picture | None, mesh: Mesh) -> tuple[RGB, Pictu
     """Return factor and texture of a colour; a texture of the mesh is multiplied by that of the material."""
     if not isinstance(color, Path):
         return color, base
-    own = load_texture(color)
     if mesh.uvs is None:
         return _mean_color(color), None
-    if base is None:
-        return (1.0, 1.0, 1.0), Picture(own)
-    height, width = (max(a, b) for a, b in zip(own.shape[:2], base.codes.shape[:2], strict=True))
-    both = cv2.resize(base.codes, (width, height))
-    product = to_linear(cv2.resize(own, (width, height))) * to_linear(both[..., :3])
-    codes = np.rint(255.0 * encode_srgb(np.clip(product, 0.0, 1.0))).astype(np.uint8)
-    return (1.0, 1.0, 1.0), Picture(np.concatenate([codes, both[..., 3:]], axis=-1), base.use)
+    use = TextureUse(0) if base is None else base.use
+    codes = joint_picture(None if base is None else mesh.images[use.image], color)
+    return (1.0, 1.0, 1.0), Picture(np.ascontiguousarray(codes[..., : base.codes.shape[2] if base else 3]), use)
 
 
 def _mean_color(color: Color) -> RGB:
     if not isinstance(color, Path):
         return color
-    r, g, b = to_linear(load_texture(color)).mean(axis=(0, 1)).tolist()
+    r, g, b = linear_texture(load_texture(color)).mean(axis=(0, 1), dtype=np.float64).tolist()
     return r, g, b
-
-
-def to_linear(codes: Codes) -> Array:
-    """Return linear values of sRGB codes."""
-    return decode_srgb(codes.astype(np.float64) / 255.0)
 
 
 def texture_plan(path: Path, name: str, materials: Sequence[ExchangeMaterial]) -> dict[tuple[int, str], Path]:
@@ -177,9 +160,9 @@ def texture_plan(path: Path, name: str, materials: Sequence[ExchangeMaterial]) -
 
 def used_materials(item: Object, mesh: Mesh) -> tuple[tuple[ExchangeMaterial, ...], npt.NDArray[np.int64] | None]:
     """Return the materials used by triangles, and the material index of each triangle, (m,); None: all the first."""
-    materials = exchange_materials_of(item, mesh)
+    materials = [_exchange_material(item, mesh, material) for material in materials_of(item).materials]
     if len(materials) == 1 or mesh.triangle_materials is None:
-        return materials[:1], None
+        return (materials[0],), None
     used, numbers = np.unique(mesh.triangle_materials, return_inverse=True)
     return tuple(materials[number] for number in used), None if len(used) == 1 else numbers.reshape(-1)
 
@@ -296,25 +279,16 @@ def _turn_to(direction: Matrix) -> Matrix:
 
 def mesh_of(item: Object | Proxy) -> Mesh:
     """Return the triangles of an object or a proxy, before scale and pose."""
-    if item.file is not None and isinstance(item, Proxy):
-        return load_mesh(item.file)
-    if isinstance(item, Object):
-        if (mesh := object_mesh(item)) is not None:
-            return mesh
-        match item.shape:
-            case "sphere":
-                return sphere_mesh(item.radius)
-            case "torus":
-                return torus_mesh(item.major_radius, item.minor_radius)
-            case "disk":
-                return disk_mesh(item.radius)
-            case "tube":
-                return tube_mesh(item.radius, item.length)
+    mesh = object_mesh(item) if isinstance(item, Object) else None
+    if mesh is not None:
+        return mesh
+    if isinstance(item, Object) and item.shape == "sphere":
+        return sphere_mesh(item.radius)
     if item.shape == "box":
         return box_mesh(item.size)
-    x, y = (0.5 * length for length in item.size[:2])
-    corners = [[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]
-    return make_mesh(corners, [[0, 1, 2], [0, 2, 3]], [[0, 0, 1]] * 4, [[0, 0], [1, 0], [1, 1], [0, 1]])
+    if item.shape in ("plane", "rect"):
+        return rect_mesh(item.size)
+    return make_mesh(mesh_key(item))
 
 
 def texture_files(scene: Scene, path: Path) -> dict[str, Path]:

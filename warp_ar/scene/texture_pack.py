@@ -112,7 +112,7 @@ class TexturePack:
         if key not in self._uses:
             if place_key not in self._places:
                 self._kept.append(image)
-                self._places[place_key] = self._place(_picture(image, path), encoded=encoded, cutoff=cutoff)
+                self._places[place_key] = self._place(joint_picture(image, path), encoded=encoded, cutoff=cutoff)
             self._uses[key] = len(self.records)
             self.records.append({**self._places[place_key], **_reading(use, self._places[place_key])})
         return self._uses[key]
@@ -147,8 +147,8 @@ def _reading(use: TextureUse, place: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _picture(image: ByteArray | None, path: Path | None) -> ByteArray:
-    """Return the picture of the mesh file or of the scene, or their product in linear light."""
+def joint_picture(image: ByteArray | None, path: Path | None) -> ByteArray:
+    """Return the picture of the mesh file or of the scene, or their product in linear light, (h, w, 4)."""
     if path is None:
         assert image is not None
         return image
