@@ -45,7 +45,7 @@ class _Event:
 
     @property
     def is_complete(self) -> bool:
-        self.captured += device._CAPTURES.capturing
+        self.captured += device._CAPTURES.holders < 0
         self.asked += 1
         return self.looks is not None and self.asked > self.looks
 

@@ -34,10 +34,10 @@ from warp_ar.calibration.camera_calibration import calibrate_camera, write_camer
 from warp_ar.calibration.card import PAPERS, write_card
 from warp_ar.calibration.response import MOST_DEVIATION, measure_grey_response, measure_response, write_response
 from warp_ar.checks.check_ball import DULL, inside_contrast
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, FROM_0, Parser, count, run_command, seconds
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, FROM_0, Parser, count, file_to_amend, run_command, seconds
 from warp_ar.errors import UsageError, say
 from warp_ar.output.places import check_places, check_replaceable
-from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
+from warp_ar.scene import CharucoBoard, Marker, load_scene, loads_scene
 from warp_ar.scene.description import INTRINSICS
 from warp_ar.scene.starter import amend_scene, guesses
 from warp_ar.sources.sources import open_source, source_of
@@ -91,12 +91,7 @@ def make_parser() -> argparse.ArgumentParser:
     option = add("card", "write the card, or a marker or board of your own, to print at true size", "card.pdf")
     option("--dictionary", metavar="NAME", help=f"OpenCV dictionary of a single marker (default: {Marker.dictionary})")
     option("--id", type=FROM_0, metavar="N", help="print this marker instead of the card (default: 0)")
-    option(
-        "--size",
-        type=float,
-        metavar="X",
-        help="side of the marker's black square, metres (default: 0.08)",
-    )
+    option("--size", type=float, metavar="X", help="side of the marker's black square, metres (default: 0.08)")
     option("--board", metavar="TEXT", help=board)
     option("--paper", default="a4", metavar="|".join(PAPERS), help="size of the page (default: a4)")
     option("--dpi", type=float, default=600.0, help="dots per inch (default: 600)")
@@ -109,11 +104,7 @@ def make_parser() -> argparse.ArgumentParser:
     option("--frames", type=count, metavar="N", help="stop after N frames of each video or device")
     option("--fisheye", action="store_true", help="for fisheye lenses: action cameras, phones' widest")
     option = add("ball", "measure the place and radius of a scene's mirror ball", None)
-    option(
-        "scene",
-        metavar="SCENE",
-        help="a scene with camera, marker and a rough [probe] with radius",
-    )
+    option("scene", metavar="SCENE", help="a scene with camera, marker and a rough [probe] with radius")
     option("--source", metavar="PATH|INDEX", help="frames instead of the scene's own")
     option("--frames", type=count, default=60, metavar="N", help="frames to use (default: 60)")
     option("--keep-radius", action="store_true", help="keep the scene's radius")
@@ -124,13 +115,8 @@ def make_parser() -> argparse.ArgumentParser:
     option("pictures", nargs="+", metavar="PATH|INDEX", help=text)
     text = "exposure times of the pictures in order, seconds, such as 1/200 1/50 0.08"
     option("--exposures", nargs="+", type=seconds, metavar="S", help=text)
-    option(
-        "--frames",
-        type=count,
-        default=24,
-        metavar="N",
-        help="frames of each video or device, without --exposures (default: 24)",
-    )
+    text = "frames of each video or device, without --exposures (default: 24)"
+    option("--frames", type=count, default=24, metavar="N", help=text)
     text = "write response.txt beside this scene and into its [camera]"
     option("--write", type=Path, metavar="SCENE", help=text)
     return parser
@@ -167,8 +153,8 @@ def _run_camera(options: argparse.Namespace, target: Path | None) -> int:
 
 def _run_ball(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
-    if options.write and scene.path in bundled_scenes().values():
-        raise UsageError(f"--write: {options.scene} is a bundled scene, which is not changed; copy it first")
+    if options.write:
+        file_to_amend(scene, options.scene)
     if not scene.probes:
         raise UsageError(f"{options.scene}: expected a [probe] with a rough center and the radius")
     spec = source_of(scene, options.source)
@@ -204,10 +190,8 @@ def _run_ball(options: argparse.Namespace) -> int:
                 f"probe {index}: the frames are too similar to measure the radius; the scene's is kept. Move the "
                 "camera around"
             )
-        flat = inside_contrast(views, camera, dataclasses.replace(probe, center=report.center)) < DULL
-        if flat:
+        if inside_contrast(views, camera, dataclasses.replace(probe, center=report.center)) < DULL:
             say(f"probe {index}: its picture shows no reflections: is the ball there, uncovered and polished?")
-        if flat:
             code = EXIT_FAILED
         elif not report.is_usable:
             say(
@@ -226,17 +210,14 @@ def _run_response(options: argparse.Namespace, target: Path | None) -> int:
     told = "sRGB: 0.2159"
     if options.exposures is None:
         found = measure_grey_response(_pictures(options.pictures, options.frames))
-        curve = found.curve
-        low, high = found.span
-        if target is not None and (interval := 2 * found.deviation[128].max()) > MOST_DEVIATION:
+        curve, interval, (low, high) = found.curve, 2 * found.deviation[128].max(), found.span
+        if target is not None and interval > MOST_DEVIATION:
             say(
                 f"the curve is known only to +/- {interval:.0%} from {found.views} pictures, so it may be sRGB: "
                 "nothing is written. Take pictures of the card under exposures or lamps that differ more"
             )
             return EXIT_FAILED
-        told += (
-            f"; +/- {2 * found.deviation[128].max():.0%}, by {found.views} pictures with codes {low:.0f} to {high:.0f}"
-        )
+        told += f"; +/- {interval:.0%}, by {found.views} pictures with codes {low:.0f} to {high:.0f}"
     else:
         curve = measure_response(list(_pictures(options.pictures)), options.exposures)
     write_response(curve, options.output)
@@ -252,10 +233,7 @@ def _target(options: argparse.Namespace) -> Path | None:
     """Return the scene file to write a camera or response into; None without ``--write``."""
     if options.command not in ("camera", "response") or options.write is None:
         return None
-    path = load_scene(options.write).path
-    assert path is not None
-    if path in bundled_scenes().values():
-        raise UsageError(f"--write: {options.write} is a bundled scene, which is not changed; copy it first")
+    path = file_to_amend(load_scene(options.write), options.write)
     options.output = path.parent / options.output.name
     return path
 

@@ -22,6 +22,7 @@ from typing import Any, Final, NoReturn
 from warp_ar.begin import EXIT_INTERRUPTED, EXIT_TERMINATED, end_at_once, handling
 from warp_ar.errors import SinkError, UsageError, WarpArError, causes, reason, say
 from warp_ar.output.sink import close_open_sinks
+from warp_ar.scene import Scene, bundled_scenes
 from warp_ar.scene.description import LATLONG_AXES
 
 EXIT_DONE = 0
@@ -89,18 +90,9 @@ _COMMON: Final[dict[str, dict[str, Any]]] = {
         "choices": LATLONG_AXES,
         "help": "axes of the light file (default: as it states, else y-up for .exr, blender for .hdr)",
     },
-    "--device": {
-        "default": "auto",
-        "metavar": "auto|cpu|cuda:0",
-        "help": "where the kernels run (default: auto)",
-    },
+    "--device": {"default": "auto", "metavar": "auto|cpu|cuda:0", "help": "where the kernels run (default: auto)"},
     "--frames": {"type": count, "metavar": "N", "help": "stop after N frames"},
-    "--shrink": {
-        "type": count,
-        "default": 1,
-        "metavar": "N",
-        "help": "divide width and height of frames (default: 1)",
-    },
+    "--shrink": {"type": count, "default": 1, "metavar": "N", "help": "divide width and height of frames (default: 1)"},
     "--overwrite": {"action": "store_true", "help": "also replace files that this program did not write"},
     "--rectangle-size": {"type": float, "nargs": 2, "metavar": ("W", "H"), "help": "the rectangle's sides in metres"},
     "--focal-35mm": {
@@ -112,11 +104,37 @@ _COMMON: Final[dict[str, dict[str, Any]]] = {
 """Options that have the same meaning in several commands."""
 
 
+def file_to_amend(scene: Scene, given: object) -> Path:
+    """Return the file of a scene that ``--write`` changes.
+
+    Args:
+        scene: The scene, read from a file.
+        given: The scene as the options name it.
+
+    Raises:
+        UsageError: The scene is a bundled one.
+    """
+    if scene.path is None or scene.path in bundled_scenes().values():
+        raise UsageError(f"--write: {given} is a bundled scene, which is not changed; copy it first")
+    return scene.path
+
+
+class _BriefHelp(argparse.HelpFormatter):
+    """Formatter of help without the options that few runs need."""
+
+    def add_argument(self, action: argparse.Action) -> None:
+        if not getattr(action, "rare", False):
+            super().add_argument(action)
+
+
 class Parser(argparse.ArgumentParser):
     """Argument parser whose errors are one line, like all error messages of this package.
 
     ``--help`` leaves out options that are declared by ``add_rare``; ``--help-all`` lists them.
     """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(formatter_class=_BriefHelp, **options)
 
     def add_rare(self, *flags: str, group: argparse._ActionsContainer, **options: Any) -> None:
         """Declare an option that few runs need; the arguments are those of ``add_argument``."""
@@ -128,22 +146,6 @@ class Parser(argparse.ArgumentParser):
         """Declare common options by name, or the argument ``scene``; ``add`` may add them to a group."""
         for name in names:
             (add or self.add_argument)(name, **_COMMON[name])
-
-    def format_help(self) -> str:
-        """Return the help, without the rare options."""
-        rare = [action for action in self._actions if getattr(action, "rare", False)]
-        words = [action.help for action in rare]
-        for action in rare:
-            action.help = argparse.SUPPRESS
-        try:
-            return super().format_help()
-        finally:
-            for action, text in zip(rare, words, strict=True):
-                action.help = text
-
-    def format_all(self) -> str:
-        """Return the help with all options."""
-        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Report an invalid argument.
@@ -174,8 +176,8 @@ class Parser(argparse.ArgumentParser):
 
 class _HelpAll(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        assert isinstance(parser, Parser)
-        print(parser.format_all(), end="")
+        parser.formatter_class = argparse.HelpFormatter
+        parser.print_help()
         parser.exit()
 
 

@@ -80,45 +80,33 @@ def compiling() -> Iterator[None]:
 
 
 class _Captures:
-    """Mutual exclusion of threads that capture a graph and threads that wait for events: CUDA does not allow both."""
+    """Lock of one thread that captures a graph, or of several that wait for events: CUDA does not allow both."""
 
     def __init__(self) -> None:
         self.changed = threading.Condition()
-        self.waiting = 0
-        self.capturing = False
+        self.holders = 0
+        """Number of threads that wait for events; -1 while a graph is captured."""
+
+    @contextlib.contextmanager
+    def held(self, change: int) -> Iterator[None]:
+        """Hold the lock to wait for an event (``change`` = 1) or to capture a graph (-1)."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.holders == 0 or (self.holders > 0 and change > 0))
+            self.holders += change
+        try:
+            yield
+        finally:
+            with self.changed:
+                self.holders -= change
+                self.changed.notify_all()
 
 
 _CAPTURES = _Captures()
 
 
-@contextlib.contextmanager
-def capturing() -> Iterator[None]:
-    """Context for capturing a graph: no thread may wait for an event meanwhile, which CUDA forbids."""
-    now = _CAPTURES
-    with now.changed:
-        now.changed.wait_for(lambda: not now.waiting and not now.capturing)
-        now.capturing = True
-    try:
-        yield
-    finally:
-        with now.changed:
-            now.capturing = False
-            now.changed.notify_all()
-
-
-@contextlib.contextmanager
-def _asking() -> Iterator[None]:
-    """Context for calls, such as waiting for an event, that CUDA forbids while a graph is captured."""
-    now = _CAPTURES
-    with now.changed:
-        now.changed.wait_for(lambda: not now.capturing)
-        now.waiting += 1
-    try:
-        yield
-    finally:
-        with now.changed:
-            now.waiting -= 1
-            now.changed.notify_all()
+def capturing() -> contextlib.AbstractContextManager[None]:
+    """Return the context for capturing a graph: no thread waits for an event meanwhile, which CUDA forbids."""
+    return _CAPTURES.held(-1)
 
 
 def wait_for(event: Any) -> None:
@@ -131,7 +119,7 @@ def wait_for(event: Any) -> None:
     """
     stop = time.perf_counter() + LONGEST_ASKING
     while True:
-        with _asking():
+        with _CAPTURES.held(1):
             if event.is_complete:
                 return
             if time.perf_counter() > stop:  # an event of failed work never completes; CUDA's own wait raises its error

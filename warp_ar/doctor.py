@@ -22,8 +22,8 @@ from warp_ar.begin import importing
 from warp_ar.checks.check_pictures import Look
 from warp_ar.checks.checkup import FRAMES, check_and_look
 from warp_ar.checks.finding import Finding, worst_first
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, count, run_command
-from warp_ar.errors import UsageError, printable, say
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, count, file_to_amend, run_command
+from warp_ar.errors import printable, say
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
 from warp_ar.scene.starter import amend_scene
 from warp_ar.sources.sources import source_of
@@ -81,24 +81,14 @@ def check_machine() -> tuple[list[str], list[Finding]]:
     device = resolve_device("auto")
     told = [f"device: {device.name} ({usable_cores()} cores)" if device.is_cpu else f"device: {device.name}"]
     driver = wp.get_cuda_driver_version()
-    told.append(
-        "driver: " + ("none for CUDA, so kernels run on the CPU" if driver is None else f"CUDA {driver[0]}.{driver[1]}")
-    )
+    version = "none for CUDA, so kernels run on the CPU" if driver is None else f"CUDA {driver[0]}.{driver[1]}"
+    told.append(f"driver: {version}")
     cache = str(wp.config.kernel_cache_dir)
-    found: list[Finding] = []
     told.append(f"kernels: kept in {printable(cache)}; the first run of a kind of scene compiles them")
-    missing = []
-    for name in ("libx264", "h264"):
-        try:
-            av.codec.Codec(name, "w" if name == "libx264" else "r")
-        except ValueError:
-            missing.append(name)
-    told.append(f"codecs: {'H.264 is written and read' if not missing else 'without ' + ', '.join(missing)}")
-    if missing:
-        found.append(
-            Finding("machine.codec", f"PyAV has no {', '.join(missing)}", "install PyAV's own wheel: pip install av")
-        )
-    return told, found
+    missing = ", ".join(sorted({"libx264", "h264"} - av.codecs_available))
+    told.append(f"codecs: {'without ' + missing if missing else 'H.264 is written and read'}")
+    remedy = "install PyAV's own wheel: pip install av"
+    return told, [Finding("machine.codec", f"PyAV has no {missing}", remedy)] if missing else []
 
 
 def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]:
@@ -201,9 +191,8 @@ def _write_polish(scene: Scene, polish: TablePolish | None, misled: bool) -> Non
 
 def _run(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
-    bundled = scene.path in bundled_scenes().values()
-    if options.write and bundled:
-        raise UsageError(f"--write: {options.scene} is a bundled scene, which is not changed; copy it first")
+    if options.write:
+        file_to_amend(scene, options.scene)
     told, found = check_machine()
     source = source_of(scene, options.source)
     if source is None:
@@ -218,7 +207,7 @@ def _run(options: argparse.Namespace) -> int:
         misled = any(finding.name.startswith(MISLEADING) for finding in found)
         if look is not None and not misled:
             polish = look_for_polish(scene, look, status.update)
-    own = None if bundled else str(options.scene)
+    own = None if scene.path in bundled_scenes().values() else str(options.scene)
     if polish is not None:
         told += polish.lines
     for line in told:

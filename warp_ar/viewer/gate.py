@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import os
 import socket
 import ssl
 import time
@@ -90,12 +91,8 @@ class Connection(web.RequestHandler):
 
 def file_limit() -> int:
     """Return how many files this process may open."""
-    try:
-        import resource
-    except ImportError:  # Windows, where sockets are no files
-        return 8192
-    soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return 8192 if soft == resource.RLIM_INFINITY else soft
+    most = os.sysconf("SC_OPEN_MAX") if hasattr(os, "sysconf") else 0  # Windows, where sockets are no files
+    return most if most > 0 else 8192
 
 
 class Gate:
