@@ -16,7 +16,7 @@ from warp_ar.scene import Exposure, Light, MirrorMaterial, PhongMaterial, Proxy,
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.card_layout import CARD_MARKER
-from warp_ar.viewer import edits, protocol
+from warp_ar.viewer import edits
 from warp_ar.viewer.controls import Controls, Feed
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.protocol import parse_text
@@ -126,7 +126,7 @@ def test_every_bundled_scene_is_told_to_the_page_without_a_path(name: str) -> No
     assert "/" not in record
 
 
-@pytest.mark.parametrize(("part", "kind"), [(part, kind) for part, kinds in protocol.KINDS.items() for kind in kinds])
+@pytest.mark.parametrize(("part", "kind"), edits.NEW)
 def test_what_can_be_added_can_be_read_back(part: str, kind: str) -> None:
     scene = edits.add_part(page_scene(), part, kind)
     assert edits.checked(scene) == scene

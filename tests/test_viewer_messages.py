@@ -45,7 +45,7 @@ def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
         ('{"type": "ping", "sent": NaN}', "ping: sent"),
         ('{"type": "set", "part": "camera", "index": 0, "key": "fx", "value": 1}', "set: part"),
         ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, 3, 4]}', "set: value"),
-        ('{"type": "add", "part": "object", "kind": "mesh"}', "add: kind"),
+        ('{"type": "add", "part": "probe", "kind": "sphere"}', "add: part"),
         ('{"type": "outline", "kind": "wall", "points": [[0, 0], [1, 0], [1, 1], [0, "x"]]}', "outline: points"),
         ('{"type": "card", "radius": "large", "ruler": 0.1}', "card: radius"),
         ('{"type": "camera", "width": 100000, "height": 480}', "camera: width"),

@@ -37,57 +37,6 @@ TOGETHER_SECONDS: Final = 1.0
 """Longest time between two changes of one value that count as one edit (a dragged slider), seconds."""
 
 
-class History:
-    """Undo history: edits in order, each with a label and the state before or after it.
-
-    Callers hold the lock of the ``Controls`` that own the history.
-    """
-
-    def __init__(self) -> None:
-        self.done: list[tuple[str, Wanted]] = []
-        self.undone: list[tuple[str, Wanted]] = []
-        self._last = -TOGETHER_SECONDS
-
-    def note(self, label: str, before: Wanted, now: float) -> None:
-        """Record an edit.
-
-        Args:
-            label: Description of the edit. Successive edits with equal labels may be merged.
-            before: State before the edit.
-            now: Time on a monotonic clock, seconds.
-        """
-        self.undone.clear()
-        same = bool(self.done) and self.done[-1][0] == label and now - self._last < TOGETHER_SECONDS
-        self._last = now
-        if not same:
-            self.done = [*self.done, (label, before)][-MOST_EDITS:]
-
-    def move(self, wanted: Wanted, *, back: bool) -> Wanted | None:
-        """Undo the last edit, or with ``back`` False redo the last undone edit.
-
-        Returns:
-            The new state; None if there is no such edit.
-        """
-        source, target = (self.done, self.undone) if back else (self.undone, self.done)
-        if not source:
-            return None
-        label, other = source.pop()
-        target.append((label, wanted))
-        self._last = -TOGETHER_SECONDS
-        # Quality is not part of the history, as a budget changes it too.
-        return dataclasses.replace(other, quality=wanted.quality)
-
-    def drop(self, before: Wanted) -> None:
-        """Remove the last edit if ``before`` is the state before it, because its pipeline could not be built."""
-        if self.done and dataclasses.replace(self.done[-1][1], quality=before.quality) == before:
-            self.done.pop()
-
-    def clear(self) -> None:
-        """Forget all edits."""
-        self.done.clear()
-        self.undone.clear()
-
-
 REMEDY: Final = "press “My camera”, which opens the camera of the machine that shows this page"
 
 
@@ -144,6 +93,10 @@ class Feed:
         """True if a browser pushes the frames."""
         return isinstance(self.source, QueueSource)
 
+    def camera_for(self, wanted: Wanted) -> Camera:
+        """Return the camera of the frames: calibrated on the page, else the feed's own, else the scene's."""
+        return wanted.camera_of(self.source.size) or self.camera or wanted.scene.camera
+
 
 def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | None = None) -> Feed:
     """Open the given source, or without one the scene's own; an absent capture device gives a ``NoCamera``.
@@ -193,7 +146,11 @@ class Controls:
         self.stopped = False
         self.feed = feed
         self._next: Feed | None = None
-        self._history = History()
+        self._done: list[tuple[str, Wanted]] = []
+        """Labels of edits, each with the state before it; the newest last."""
+        self._undone: list[tuple[str, Wanted]] = []
+        """Labels of undone edits, each with the state after it."""
+        self._edited = -TOGETHER_SECONDS
 
     @property
     def newest_feed(self) -> Feed:
@@ -210,14 +167,13 @@ class Controls:
         with self.changed:
             self.changed.wait_for(lambda: self.leaving, timeout=seconds)
 
-    def _adopt(self, wanted: Wanted | None) -> None:
-        """Set the wanted state (None keeps it) and send it to the viewers.
+    def _adopt(self, wanted: Wanted) -> None:
+        """Set the wanted state and send it to the viewers.
 
         The caller holds the lock, so that the last message always describes the final state.
         """
-        if wanted is not None:
-            self.wanted = wanted
-            self._touch()
+        self.wanted = wanted
+        self._touch()
         self._notify(self.scene_message())
 
     def change(self, make: Callable[[Wanted], Wanted], label: str | None = None) -> None:
@@ -230,42 +186,54 @@ class Controls:
         with self.changed:
             before, wanted = self.wanted, make(self.wanted)
             if label is not None and wanted != before:
-                self._history.note(label, before, time.monotonic())
+                now, merged = time.monotonic(), bool(self._done) and self._done[-1][0] == label
+                if not merged or now - self._edited >= TOGETHER_SECONDS:
+                    self._done.append((label, before))
+                    del self._done[:-MOST_EDITS]
+                self._undone.clear()
+                self._edited = now
             self._adopt(wanted)
 
     def undo(self) -> None:
         """Undo the last edit, if there is one."""
-        with self.changed:
-            self._adopt(self._history.move(self.wanted, back=True))
+        self._move(self._done, self._undone)
 
     def redo(self) -> None:
         """Redo the edit that was undone last, if there is one."""
+        self._move(self._undone, self._done)
+
+    def _move(self, source: list[tuple[str, Wanted]], target: list[tuple[str, Wanted]]) -> None:
         with self.changed:
-            self._adopt(self._history.move(self.wanted, back=False))
+            if source:
+                label, wanted = source.pop()
+                target.append((label, self.wanted))
+                self._edited = -TOGETHER_SECONDS
+                # Quality is not part of the history, as a budget changes it too.
+                self._adopt(dataclasses.replace(wanted, quality=self.wanted.quality))
 
     def give_back(self, good: Wanted, refused: Wanted) -> None:
         """Restore the last good state if the refused state, whose pipeline could not be built, is still wanted."""
         with self.changed:
             if self.wanted is refused:
-                self._history.drop(good)
+                if self._done and dataclasses.replace(self._done[-1][1], quality=good.quality) == good:
+                    self._done.pop()
                 self._adopt(good)
 
     def start_anew(self, wanted: Wanted) -> None:
         """Show another scene and forget the edits of the previous one."""
         with self.changed:
-            self._history.clear()
+            self._forget_edits()
             self._adopt(wanted)
+
+    def _forget_edits(self) -> None:
+        self._done.clear()
+        self._undone.clear()
 
     def scene_message(self) -> dict[str, Any]:
         """Return the message of the edited scene, with the labels of the edits that undo and redo would affect."""
         with self.changed:
-            undo, redo = (edits[-1][0] if edits else None for edits in (self._history.done, self._history.undone))
+            undo, redo = (edits[-1][0] if edits else None for edits in (self._done, self._undone))
             return {"type": "scene", "scene": wanted_record(self.wanted), "undo": undo, "redo": redo}
-
-    def camera_of(self, feed: Feed, wanted: Wanted | None = None) -> Camera:
-        """Return a feed's camera: calibrated on the page, else the feed's own, else the scene's."""
-        wanted = wanted or self.wanted
-        return wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
 
     def _touch(self) -> None:
         self.edits += 1
@@ -309,16 +277,14 @@ class Controls:
         if current.live:
             current.close()
 
-    def adopt(self) -> bool:
-        """Start to use the feed that was requested last; return False if none was requested."""
+    def adopt(self) -> None:
+        """Start to use the feed that was requested last, if one was."""
         with self.changed:
-            if self._next is None:
-                return False
-            self.feed, self._next = self._next, None
-            if self.feed.wanted is not None:
-                self._history.clear()
-            self._adopt(self.feed.wanted or self.wanted)
-        return True
+            if self._next is not None:
+                self.feed, self._next = self._next, None
+                if self.feed.wanted is not None:
+                    self._forget_edits()
+                self._adopt(self.feed.wanted or self.wanted)
 
     def use_estimate(self, camera: Camera, feed: Feed) -> bool:
         """Use the camera estimated from a feed's frames; return False if that feed is no longer in use."""

@@ -131,7 +131,7 @@ _KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "marker": ("dictionary", "id", "size"),
     "material": ("base_color", "diffuse", "specular", "shininess", "metallic", "roughness", "color", "intensity"),
 }
-_NEW: Final[Mapping[tuple[str, str], Object | Light]] = {
+NEW: Final[Mapping[tuple[str, str], Object | Light]] = {
     ("object", "sphere"): Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
     ("object", "box"): Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
     ("object", "torus"): Object(
@@ -277,8 +277,14 @@ def _material(material: Material, key: str, value: Any) -> Material:
 
 
 def add_part(scene: Scene, part: str, kind: str) -> Scene:
-    """Return the scene with a new object or light of ``kind``."""
-    return add_item(scene, part, _NEW[part, kind])
+    """Return the scene with a new object or light of ``kind``; meshes are dropped files, and proxies are outlined.
+
+    Raises:
+        UsageError: There is no such kind, or the scene has ``MOST_PARTS`` already.
+    """
+    if (part, kind) not in NEW:
+        raise UsageError(f"add {part} {kind[:40]!r}: expected one of {', '.join(map(' '.join, NEW))}")
+    return add_item(scene, part, NEW[part, kind])
 
 
 def add_item(scene: Scene, part: str, item: Object | Light | Proxy) -> Scene:
@@ -428,10 +434,7 @@ def make_edit(command: Command, original: Wanted, seconds: float = 0.0) -> tuple
         "effect": (lambda w: w.with_effect(**fields), f"switch {fields.get('name')} {'on' if on else 'off'}"),
         "method": (lambda w: w.with_method(**fields), f"choose the method of {fields.get('stage')}"),
         "card": (of_scene(use_card), "use the printed card"),
-        "reset": (
-            lambda w: dataclasses.replace(original, quality=w.quality, cameras=w.cameras),
-            "undo all edits",
-        ),
+        "reset": (lambda w: dataclasses.replace(original, quality=w.quality, cameras=w.cameras), "undo all edits"),
     }
     edit, label = edits.get(command.type, (None, ""))
     return None if edit is None else (edit, label.replace("_", " "))

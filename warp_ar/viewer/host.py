@@ -369,7 +369,6 @@ class Host:
             "budget": budget.budget,
             "load": budget.load,
             "costs": budget.costs(),
-            "watchers": controls.watchers,
         }
 
     def _missing(self) -> dict[str, str] | None:
@@ -408,9 +407,10 @@ class Host:
     # ---------------------------------------------------------------------------------------------------------- frames
 
     def _use_calibrated(self, camera: Camera) -> None:
-        transfer = self._controls.camera_of(self._controls.feed).transfer  # a board does not measure it
+        controls = self._controls
+        transfer = controls.feed.camera_for(controls.wanted).transfer  # a board does not measure it
         camera = dataclasses.replace(camera, transfer=transfer)
-        self._controls.change(lambda w: w.with_camera(camera), "calibrate the camera")
+        controls.change(lambda w: w.with_camera(camera), "calibrate the camera")
 
     @property
     def fps(self) -> float:
@@ -643,7 +643,7 @@ class Host:
             taken, stamp = pushed.taken, pushed.stamp
         elif self._controls.feed.source.live and self._controls.playing:
             taken = self._controls.feed.source.start + frame.time  # earlier than now if the frame has waited
-        camera = self._controls.camera_of(self._controls.feed)
+        camera = self._controls.feed.camera_for(self._controls.wanted)
         size = frame.image.shape[1], frame.image.shape[0]
         if (camera.width, camera.height) != size:
             camera = guessed_camera(*size)

@@ -45,8 +45,7 @@ _AS_QUICK: Final = ("low", "paper")
 
 def make_target(wanted: Wanted, feed: Feed) -> Target:
     """Return the scene, quality, size, outputs and exposures for which a pipeline is built."""
-    camera = wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
-    scene = dataclasses.replace(wanted.shown_scene(), camera=camera)
+    scene = dataclasses.replace(wanted.shown_scene(), camera=feed.camera_for(wanted))
     # The page draws handles on objects and lights, which needs the pose even if no stage does.
     outputs = ("image", "pose") if wanted.scene.objects or wanted.scene.lights else ("image",)
     return Target(scene, wanted.shown_quality(), feed.source.size, outputs, feed.source.exposures)

@@ -43,12 +43,8 @@ PARTS: Final = ("object", "light", "proxy", "exposure", "marker")
 """Parts of a scene that the page can edit."""
 ANIMATED: Final = ("animation", "speed", "loop", "paused")
 """Values of an object's animation that the page can change."""
-KINDS: Final = {
-    "object": ("sphere", "box", "torus"),
-    "light": ("point", "spot", "directional"),
-    "proxy": (),
-}
-"""Kinds of each part that the page can add. Meshes are files, which the page drops; proxies are outlined."""
+LISTED: Final = ("object", "light", "proxy")
+"""Parts of which a scene may have several."""
 OUTLINES: Final = ("plane", "wall", "box")
 """Kinds of proxies that can be outlined by four points of the picture."""
 SETUP_STEPS: Final = ("check", "ball", "light", "response")
@@ -128,8 +124,8 @@ def _value(value: Any) -> Any:
     return tuple(map(float, value)) if isinstance(value, list) else value
 
 
-def _optional(check: Check) -> Check:
-    return lambda value: None if value is None else check(value)
+def _budget(value: Any) -> float | None:
+    return None if value is None else _number(1.0, 10000.0)(value)
 
 
 def _points(value: Any) -> tuple[tuple[float, float], ...]:
@@ -155,19 +151,19 @@ _MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
     "set": {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value},
     # Changes the playback of an object's animation; a flag is 0 or 1.
     "animate": {"index": _INDEX, "key": _choice(*ANIMATED), "value": _number(-1.0, 1e3)},
-    "add": {"part": _choice(*KINDS), "kind": _name},
+    "add": {"part": _choice(*LISTED), "kind": _name},
     # Adds a copy of an object, light or proxy near the original.
-    "duplicate": {"part": _choice(*KINDS), "index": _INDEX},
+    "duplicate": {"part": _choice(*LISTED), "index": _INDEX},
     # Moves an object vertically until its lowest point is on the desk.
     "snap": {"index": _INDEX},
-    "remove": {"part": _choice(*KINDS), "index": _INDEX},
-    "show": {"part": _choice(*KINDS), "index": _INDEX, **_ON},
+    "remove": {"part": _choice(*LISTED), "index": _INDEX},
+    "show": {"part": _choice(*LISTED), "index": _INDEX, **_ON},
     "effect": {"name": _choice(*EFFECTS), **_ON},
     "quality": _NAME,
     # Chooses the method of one stage; an empty name restores the preset's method.
     "method": {"stage": _name, "method": _name},
     # Sets the budget, milliseconds per frame; null returns to a preset.
-    "budget": {"ms": _optional(_number(1.0, 10000.0))},
+    "budget": {"ms": _budget},
     # Chooses the picture to compare with: none, the camera's frame, a preset, or the reference.
     "compare": {"other": _choice("", "camera", *CONVERGING, *PRESETS)},
     # Plays frames, or holds the present one.
@@ -216,8 +212,6 @@ def parse_text(text: str) -> Command:
             fields[key] = check(message[key])
         except ProtocolError as error:
             raise ProtocolError(f"{kind}: {key}: {error}") from error
-    if kind == "add" and fields["kind"] not in KINDS[fields["part"]]:
-        raise ProtocolError(f"add: kind: expected one of {', '.join(KINDS[fields['part']])}")
     return Command(kind, fields)
 
 

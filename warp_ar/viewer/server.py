@@ -39,7 +39,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from warp_ar.errors import SinkError, UsageError, WarpArError
 from warp_ar.light.latlong_axes import AXES
-from warp_ar.output.environment_axes import FACES, LAYOUTS
+from warp_ar.output.environment_axes import FACES
 from warp_ar.scene import bundled_scenes
 from warp_ar.srgb import encode_srgb
 from warp_ar.stages.quality import PRESETS
@@ -216,7 +216,6 @@ class Server:
         folder = importlib.resources.files("warp_ar.viewer") / "static"
         self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
         self._coming = self._listeners = 0
-        self._watching: asyncio.TimerHandle | None = None
         lights = [*(f"/light.{kind}" for kind in ("json", "exr", "hdr")), *(f"/light/{name}.hdr" for name in FACES)]
         self.app.add_routes(
             [
@@ -500,24 +499,15 @@ class Server:
             self._coming -= 1
         return web.Response(text=f"{words}\n")
 
-    def _rest(self, host: Host) -> None:
-        self._watching = None
-        host.watch(-1)
-
     async def _light(self, request: web.Request) -> web.Response:
         """Answer a request for the light: its record, its picture, or one face of its cube map."""
         stem, _, kind = request.path.rpartition("/")[2].partition(".")
         layout, options = request.query.get("layout", "latlong"), {"axes": _axes(request)}
-        if layout not in LAYOUTS:
-            raise web.HTTPBadRequest(text=f"layout = {layout!r}: expected {' or '.join(LAYOUTS)}\n")
         if kind != "json":
             options |= _numbers(request)
         host = await self.started()
-        if self._watching is None:
-            host.watch(1)
-        else:
-            self._watching.cancel()
-        self._watching = asyncio.get_running_loop().call_later(WATCH_SECONDS, self._rest, host)
+        host.watch(1)
+        asyncio.get_running_loop().call_later(WATCH_SECONDS, host.watch, -1)
         if host.light_state is None:
             words = "the environment is not captured: no stage of this scene reads it, or the marker was not seen\n"
             raise web.HTTPConflict(text=words)

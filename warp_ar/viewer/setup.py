@@ -179,7 +179,7 @@ class SetupChecks:
     def _shown(self) -> tuple[Scene, Camera]:
         wanted, feed = self._controls.wanted, self._controls.feed
         width, height = feed.source.size
-        camera = self._controls.camera_of(feed, wanted).scaled_to(width, height)
+        camera = feed.camera_for(wanted).scaled_to(width, height)
         return dataclasses.replace(wanted.scene, camera=camera), camera
 
     def _find_outside(self, pose: Pose) -> Finding | None:

@@ -110,7 +110,7 @@ connection.addEventListener("state", ({ detail }) => {
   showBuilding();
   $("use-clip").setAttribute("aria-pressed", String(!state.camera));
   $("use-camera").setAttribute("aria-pressed", String(state.camera));
-  $("fps").title = `Frames shown per second; the program lights ${state.fps.toFixed(1)} a second for ${state.watchers} viewer${state.watchers === 1 ? "" : "s"}`;
+  $("fps").title = `Frames shown per second; the program lights ${state.fps.toFixed(1)} a second`;
   showCamera();
   showBall(state.ball);
 });
