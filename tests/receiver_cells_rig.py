@@ -123,21 +123,14 @@ class View:
     def cells(self, stride):
         return tuple(-(-n // stride) for n in self.size)
 
-    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False):
+    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False, threads=1):
         share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
         written = filled(SurfaceCells(), values=share, surface=surface, stride=stride)
-        receiver_cells.estimate_ambient_visibility(
-            self.config,
-            self.params,
-            self.scene,
-            self.lights,
-            self.receiver(cells),
-            samples[:count],
-            bounced,
-            written,
-            rows=rows,
-        )
+        parts = wp.empty((*self.cells(stride), threads), dtype=receiver_cells.LightPart)
+        inputs = self.params, self.scene, self.lights, self.receiver(cells), samples[:count]
+        receiver_cells.sum_ambient_light(self.config, *inputs, bounced, written, parts, rows=rows)
+        receiver_cells.find_ambient_visibility(parts, bounced, written, rows=rows)
         return share.numpy(), surface.numpy()
 
     def send(self, stride=4, rows=None, out=None, cells=None):

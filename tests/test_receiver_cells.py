@@ -166,14 +166,17 @@ def brute_force(samples, size, boxes=(), balls=(), facing=1.0, stride=4):
     return out
 
 
-def test_share_matches_twin(device):
+@pytest.mark.parametrize("threads", [1, 8])
+def test_share_matches_twin(device, threads):
     """A sun, a lamp at a place, a box and a ball; the twin asks every sample at every cell."""
     environment = with_sun(9, 40, 300.0, np.float32(np.random.default_rng(1).uniform(0.2, 1, (32, 64, 3))))
     samples = draw(environment, 256)[2]
     environment_samples.place_emitters(lamp_at((0.2, 0.1, 0.4)), ONE_BALL, samples)
     corners, (center, radius) = ((0.1, -0.1, 0), (0.22, 0.14, 0.08)), ((-0.1, 0.03, 0.05), 0.04)
     facing = np.array([0.6, 0.5, 0.4])
-    share, surface = View((DESK, box(*corners)), [ball(center, radius)], surroundings=facing).share(samples)
+    share, surface = View((DESK, box(*corners)), [ball(center, radius)], surroundings=facing).share(
+        samples, threads=threads
+    )
     expected = brute_force(samples, SIZE_OF_FRAME, [corners], [(center, radius, 0.85)], facing)
     on_desk = surface == 0
     # A sample at an outline falls to either side in float32: a few cells of the desk differ by one of them.

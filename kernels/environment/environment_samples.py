@@ -38,7 +38,7 @@ from warp_ar.kernels.color import brightness
 from warp_ar.kernels.launch import launch, launch_tiles, row_launcher, tile_kernel
 from warp_ar.kernels.safe_math import safe_radiance
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
-from warp_ar.kernels.structs import Emitter
+from warp_ar.kernels.structs import Emitter, vec8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -162,16 +162,25 @@ def sum_along_rows_kernel(
     # Out:
     cumulative_out: wp.array2d[wp.float32],
 ):
-    """Write the running sums of brightness along one row, by compensated summation (a sun next to a dim sky)."""
+    """Write the running sums of brightness along one row, by compensated summation (a sun next to a dim sky).
+
+    Several texels are read before they are added, so that a CUDA thread waits for memory once, not for each texel.
+    """
     i = wp.tid()
+    width = environment.shape[1]
     total = float(0.0)
     lost = float(0.0)
-    for j in range(environment.shape[1]):
-        term = brightness(safe_radiance(environment[i, j])) - lost
-        after = total + term
-        lost = (after - total) - term
-        total = after
-        cumulative_out[i, j] = total
+    for start in range(0, width, 8):
+        bright = vec8()
+        for k in range(8):
+            bright[k] = brightness(safe_radiance(environment[i, wp.min(start + k, width - 1)]))
+        for k in range(8):
+            if start + k < width:
+                term = bright[k] - lost
+                after = total + term
+                lost = (after - total) - term
+                total = after
+                cumulative_out[i, start + k] = total
 
 
 @tile_kernel
@@ -360,7 +369,7 @@ def sum_environment(
         rows_out: (h,) weighted brightness and weight, summed over rows.
     """
     height = environment.shape[0]
-    launch(sum_along_rows_kernel, height, [environment], [cumulative_out])
+    launch(sum_along_rows_kernel, height, [environment], [cumulative_out], block_dim=32)
     launch_tiles(sum_rows_kernel, [height], [cumulative_out], [rows_out], block_dim=32)
 
 

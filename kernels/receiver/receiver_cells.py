@@ -85,6 +85,15 @@ class Patch:
     area: wp.float32  # square metres
 
 
+@wp.struct
+class LightPart:
+    """Sums over a part of the samples of a cell, in camera values of irradiance."""
+
+    surface: wp.int32  # ``surface_key`` of the cell; -1: not estimated
+    whole: wp.vec3  # all light
+    lost: wp.vec3  # hidden light, less the light that occluders emit or reflect
+
+
 @wp.func
 def visible_shares_of(lost: wp.vec3, whole: wp.vec3) -> wp.vec3:
     """Return 1 - lost / whole per channel, within 0..1; 1 where ``whole`` is below ``MIN_IRRADIANCE`` or NaN."""
@@ -225,17 +234,17 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
         receiver: Receiver,
         samples: wp.array[EnvironmentSample],
         bounced: wp.bool,
+        cells: SurfaceCells,
         # Out:
-        cells_out: SurfaceCells,
+        parts_out: wp.array3d[LightPart],
     ):
-        ci, cj = wp.tid()
+        ci, cj, part = wp.tid()
         ci += row_start
         rays = receiver.picture.rays
         rect = params[0].light_rect
-        stride = cells_out.stride
-        if not bounced:
-            cells_out.surface[ci, cj] = -1
-        elif cells_out.surface[ci, cj] >= 0:
+        stride = cells.stride
+        parts_out[ci, cj, part].surface = -1
+        if bounced and cells.surface[ci, cj] >= 0:
             return
         hit = visible_cell(params[0], rays, scene, receiver.probes, wp.vec2i(ci, cj), stride, MARGIN * stride, rect)
         if hit.shape < 0:
@@ -250,11 +259,10 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
             needed = is_shone_on(lights, hit)
         if not needed:
             return
-        cells_out.surface[ci, cj] = surface_key(scene, hit)
         solids = bound_solids(scene)
-        whole = wp.vec3()
-        lost = wp.vec3()
-        for k in range(samples.shape[0]):
+        sums = LightPart()
+        sums.surface = surface_key(scene, hit)
+        for k in range(part, samples.shape[0], parts_out.shape[2]):
             sample = samples[k]
             toward = sample_toward(sample, hit.point)
             cosine = wp.dot(hit.normal, toward.direction)
@@ -263,13 +271,38 @@ def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
                     places = receiver.others.places
                     toward.measure *= probe_share(places, ball_of_sample(k, places.shape[0]), hit.point)
                 flux = cosine * toward.measure * sample.radiance
-                whole += flux
+                sums.whole += flux
                 hider = find_hider(params[0], scene, receiver, hit, toward, solids)
                 if hider.hides:
-                    lost += cosine * toward.measure * (sample.radiance - hider.radiance)
-        cells_out.values[ci, cj] = visible_shares_of(lost, whole)
+                    sums.lost += cosine * toward.measure * (sample.radiance - hider.radiance)
+        parts_out[ci, cj, part] = sums
 
     return ambient_visibility_kernel
+
+
+@wp.kernel(enable_backward=False)
+def add_parts_kernel(
+    # In:
+    row_start: wp.int32,
+    parts: wp.array3d[LightPart],
+    bounced: wp.bool,
+    # Out:
+    cells_out: SurfaceCells,
+):
+    """Compute ambient visibility from a cell's sums, added in a fixed order; cells that are kept stay as they are."""
+    ci, cj = wp.tid()
+    ci += row_start
+    surface = parts[ci, cj, 0].surface
+    if surface < 0 and bounced:
+        return
+    cells_out.surface[ci, cj] = surface
+    if surface >= 0:
+        whole = wp.vec3()
+        lost = wp.vec3()
+        for part in range(parts.shape[2]):
+            whole += parts[ci, cj, part].whole
+            lost += parts[ci, cj, part].lost
+        cells_out.values[ci, cj] = visible_shares_of(lost, whole)
 
 
 @functools.cache
@@ -474,8 +507,8 @@ def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
     return gather_light_kernel
 
 
-estimate_ambient_visibility = row_launcher(make_ambient_visibility_kernel, like=lambda *given: given[-1].values)
-"""Estimate the share of the environment that reaches the receiver, for cells on which virtual lights may shine.
+sum_ambient_light = row_launcher(make_ambient_visibility_kernel)
+"""Sum the environment's light on the receiver, for cells on which virtual lights may shine, and its hidden part.
 
 Args:
     config: Kinds of shape, form of the environment's irradiance.
@@ -486,7 +519,18 @@ Args:
         ``gather_light`` if ``bounced``.
     samples: (n,) samples of the environment, the same for all cells, so that neighbours do not differ by noise. If n is
         a power of 2, the first n of a longer sequence are an aligned block of Sobol's sequence.
-    bounced: True to estimate only the cells that bounced light alone reaches; the others keep their values.
+    bounced: True to estimate only the cells that bounced light alone reaches.
+    cells: Cells of ambient visibility.
+    parts_out: (r, c, threads per cell) sums.
+"""
+
+
+find_ambient_visibility = row_launcher(add_parts_kernel, like=lambda *given: given[-1].values)
+"""Compute the share of the environment that reaches each cell of the receiver.
+
+Args:
+    parts: (r, c, n) from ``sum_ambient_light``.
+    bounced: As there; other cells keep their values.
     cells_out: Cells of ambient visibility.
 """
 

@@ -150,7 +150,7 @@ def follow_level(
         share: Share s of the card's light then that the map lacks, by channel, float32 (3).
         level_out: Radiance of recovered light over that of the estimate, by channel, float32 (3).
     """
-    launch(follow_level_kernel, (3, now.shape[0]), [now, then, *upward, share], [level_out])
+    launch(follow_level_kernel, (3, now.shape[0]), [now, then, *upward, share], [level_out], block_dim=32)
 
 
 @wp.kernel(enable_backward=False)

@@ -194,16 +194,19 @@ class Recover(Stage):
             self._stream, self._frames_stream = wp.Stream(device), wp.get_stream(device)
         height, rows = self.request.quality.environment_height, arrays["recover_cells"].shape[0]
         looks = (
-            Pass(self._look_at_card, enabled=lambda: self._asks or self._follows),
+            # The card is in the frame, so it is observed while the map is being unwrapped and filled.
+            Pass(self._look_at_card, enabled=lambda: self._asks or self._follows, reads=self.wiring.reads[3:5]),
+            Pass(self._sum_upward, enabled=lambda: self._asks or self._follows),
             Pass(self._note_card, enabled=lambda: self._asks),
             Pass(self._follow, enabled=lambda: self._follows),
         )
         return [
             Pass(self._take, on_host=True, enabled=lambda: self._arrives, beforehand=True),
+            *(looks[:1] if self._card else ()),
             *self._equations(height, rows),
-            *(looks[:2] if self._card else ()),
+            *(looks[1:3] if self._card else ()),
             Pass(self._ask, on_host=True, enabled=lambda: self._asks),
-            *(looks[2:] if self._card else ()),
+            *(looks[3:] if self._card else ()),
             Pass(self._apply_level),
             Pass(
                 self._launch(
@@ -231,10 +234,12 @@ class Recover(Stage):
 
         weigh = self._launch(weigh_boundaries, "environment_clipped", "params", "probes", "recover_missing")
         # Clipped texels are known before the map is filled.
-        passes = [Pass(weigh, rows=height, reads=("environment_clipped", "pose"))]
+        known = "environment_clipped", "pose"
+        passes = [Pass(weigh, rows=height, reads=known)]
         if self._proxies:
+            leave_out = functools.partial(leave_out_edges, self._proxies)
             names = "environment_clipped", "probes", "ray_scene", "recover_missing"
-            passes.append(Pass(self._launch(functools.partial(leave_out_edges, self._proxies), *names), rows=rows))
+            passes.append(Pass(self._launch(leave_out, *names), rows=rows, reads=known))
         return [
             *passes,
             asked(
@@ -303,9 +308,11 @@ class Recover(Stage):
         scene = arrays["params"], arrays["probes"], arrays["ray_scene"]
         kernels.observe_surfaces(self._proxies, linear, *frame, *scene, points, observations, rows=rows)
 
+    def _sum_upward(self, rows: Rows | None) -> None:
+        sum_upward(*(self._arrays[name] for name in ("filled_radiance", "recover_upward_rows", "recover_upward_now")))
+
     def _look_at_card(self, rows: Rows | None) -> None:
         arrays = self._arrays
-        sum_upward(arrays["filled_radiance"], arrays["recover_upward_rows"], arrays["recover_upward_now"])
         points = arrays["recover_points"][: len(arrays["recover_card_now"]) * CARD_STEP : CARD_STEP]
         self._observe(points, arrays["recover_card_now"], None)
 

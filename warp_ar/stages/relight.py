@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_ar.kernels.cells import SurfaceCells, cell_shape, cell_stride
 from warp_ar.kernels.receiver import receiver_cells, relight
+from warp_ar.kernels.receiver.environment_shadow import count_partials
 from warp_ar.kernels.receiver.receiver import Receiver, ReceiverCells, RelightConfig
 from warp_ar.kernels.structs import PLANE, filled
 from warp_ar.scene.kinds import trace_config
@@ -132,6 +133,11 @@ class Relight(Stage):
         cells, light_rows = receiver.cells, arrays["light_rows"]
         place = _keep_planes(config, self.request)
         passes: list[Pass] = []
+        parts: Any = None
+        if config.ambient_visibility:
+            shape, device = cells.ambient.values.shape, arrays["params"].device
+            threads = 1 if device.is_cpu else count_partials(*shape)
+            parts = wp.empty((*shape, threads), dtype=receiver_cells.LightPart, device=device)
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
             """Return a function that gives the rows of cells that pixels with virtual light read, plus ``margin``."""
@@ -144,22 +150,25 @@ class Relight(Stage):
 
             return extent
 
-        def ambient_pass(bounced: bool) -> Pass:
+        def ambient_passes(bounced: bool) -> list[Pass]:
             samples = arrays["environment_samples"][: _grain(self.features).samples]
-            estimate = receiver_cells.estimate_ambient_visibility
-            return cell_pass(cells.ambient, estimate, place, *inputs, samples, bounced)
+            sums = receiver_cells.sum_ambient_light, place, *inputs, samples, bounced, cells.ambient, parts
+            shares = receiver_cells.find_ambient_visibility, parts, bounced, cells.ambient
+            return [cell_pass(cells.ambient, *sums), cell_pass(cells.ambient, *shares)]
 
         def cell_pass(cells: SurfaceCells, launcher: Callable[..., None], *given: Any) -> Pass:
             count = len(cells.values)
             extent = rows_of(int(cells.stride), count, int(receiver_cells.MARGIN))
-            return over_rows(count, launcher, *given, cells, extent=extent)
+            return over_rows(count, launcher, *given, extent=extent)
 
         if config.area_cells:
             samples = AREA_CELLS[area_method(self.request.quality)][0]
             asked = dataclasses.replace(place, area_samples=samples)
-            passes.append(cell_pass(cells.area, receiver_cells.estimate_area_light, asked, params, scene, receiver))
+            passes.append(
+                cell_pass(cells.area, receiver_cells.estimate_area_light, asked, params, scene, receiver, cells.area)
+            )
         if config.ambient_visibility:
-            passes.append(ambient_pass(bounced=False))
+            passes += ambient_passes(bounced=False)
         if config.bounced:
             patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
             wide = _patch_stride(self.features)
@@ -168,10 +177,10 @@ class Relight(Stage):
             passes += [
                 over_rows(len(patches), receiver_cells.send_light, place, *inputs, wide, patches, extent=lit),
                 over_rows(len(patches), receiver_cells.list_patches, patches, listed, count, extent=lit),
-                cell_pass(cells.bounced, *gather),
+                cell_pass(cells.bounced, *gather, cells.bounced),
             ]
             if config.ambient_visibility:
-                passes.append(ambient_pass(bounced=True))
+                passes += ambient_passes(bounced=True)
         return passes
 
 
