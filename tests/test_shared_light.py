@@ -160,7 +160,7 @@ async def test_requests_that_are_wrong_are_named() -> None:
         await known_light(site)
         for path, words in (
             ("/light.json?axes=up", "axes = 'up': expected z-up, blender, y-up, opengl"),
-            ("/light.exr?layout=ball", "layout = 'ball': expected latlong or cube"),
+            ("/light.exr?layout=ball", "layout 'ball': expected latlong or cube"),
             ("/light.hdr?layout=cube&size=0", "size = '0': expected 1 to 1024"),
             ("/light.hdr?layout=cube&size=99999999", "expected 1 to 1024"),
             ("/light/px.hdr?axes=z-up", "z-up"),
