@@ -17,8 +17,13 @@ from warp_ar.stages.quality import Quality
 def check_number(name: str, value: object, above: float = -math.inf) -> None:
     """Check that an argument, a number of seconds, is finite and greater than ``above``.
 
+    Args:
+        name: Name of the argument in messages.
+        value: Its value, of any type.
+        above: Lower bound, which the value must exceed.
+
     Raises:
-        UsageError: The value is no finite number, or not above the bound.
+        UsageError: The value is not a finite number, or not above the bound.
     """
     if not fits(value, float) or value <= above:  # type: ignore[operator]
         right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
@@ -26,7 +31,7 @@ def check_number(name: str, value: object, above: float = -math.inf) -> None:
 
 
 def check_methods(quality: Quality) -> None:
-    """Check the method names of a ``Quality``.
+    """Check that the stages and methods that a ``Quality`` names exist.
 
     Raises:
         UsageError: A stage or method does not exist.
@@ -41,6 +46,10 @@ def check_methods(quality: Quality) -> None:
 
 def check_frames(exposures: Sequence[float], outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Check the arguments that describe frames; return the outputs with ``radiance`` expanded to its layers.
+
+    Args:
+        exposures: Exposure times of the frames, seconds.
+        outputs: Names of the outputs.
 
     Raises:
         UsageError: An exposure is invalid, or an output is unknown.

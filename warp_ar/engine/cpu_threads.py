@@ -1,7 +1,8 @@
 """Native threads that run a frame's passes on CPU, their tables, and calls back into Python.
 
-``kernels/bands.py`` describes the threads' algorithm. This module packs all launches into its tables once; for each
-frame it enters the rows of the passes to run. Steps that need Python, such as work on the host, are called back.
+``kernels/bands.py`` describes the threads' algorithm and the columns of its tables. This module packs all launches into
+the tables once. For each frame it enters the range of rows of each pass. Passes that need Python, such as work on the
+host, are run by a callback.
 """
 
 from __future__ import annotations
@@ -40,15 +41,15 @@ class _Packed:
             setattr(self.arguments, name, value)
         self.bounds = launch.bounds
         self.entry = ctypes.cast(launch.hooks.forward, ctypes.c_void_p).value or 0
-        self.launch = launch  # keeps the arrays and the loaded module alive
+        self.launch = launch  # this reference keeps the arrays and the loaded module alive
 
     def call(self) -> None:
-        """Run the launch on this thread, without holding Python's lock."""
+        """Run the launch on this thread, without the interpreter's lock."""
         _Entry(self.entry)(ctypes.addressof(self.bounds), ctypes.addressof(self.arguments))
 
 
 class _System:
-    """Functions of the operating system: semaphore, clock, and yielding the processor."""
+    """Functions of the operating system for semaphores, the clock, and yielding the processor."""
 
     def __init__(self) -> None:
         self.clock_id = 1
@@ -88,7 +89,7 @@ class _System:
 
 
 class CpuThreads:
-    """Threads of one scheduler, and the tables of its passes."""
+    """Native threads of one scheduler, and the tables of its passes."""
 
     def __init__(
         self,
@@ -103,10 +104,10 @@ class CpuThreads:
 
         Args:
             steps: Stages with their passes, in order.
-            notes: Recorded launches of each pass, by its ``id``; a pass without an entry is run by Python.
-            readers: Names of the stages that read the output of each stage.
+            notes: Recorded launches of each pass, by the ``id`` of the pass; a pass without an entry is run by Python.
+            readers: Names of the stages that read the output of each stage, by the stage's name.
             threads: Number of threads that process rows, including the caller's.
-            bands_per_pass: Number of equal bands of each pass; None: chosen by the rows and threads.
+            bands_per_pass: Number of equal bands of each pass; None: sizes depend on the rows left and on the threads.
 
         Raises:
             ValueError: There are more stages than the native tables hold.
@@ -120,7 +121,7 @@ class CpuThreads:
         self._names = [stage.name for stage, _ in steps]
         if len(steps) > bands.MOST_STAGES:
             raise ValueError(f"{len(steps)} stages; native threads run at most {bands.MOST_STAGES}")
-        self._rows: dict[int, int] = {}  # of the pass table, by the pass's id
+        self._rows: dict[int, int] = {}  # row of each pass in the pass table, by the pass's id
         self._tiles = False
         self._fill_tables(steps, notes, readers)
         self._fill_state(bands_per_pass)
@@ -181,12 +182,17 @@ class CpuThreads:
         )
 
     def _pack(self, step: Pass, notes: list[Note]) -> list[dict[str, int]] | None:
-        """Return one row of the call table for each launch of a pass; None if the pass must be launched from Python."""
+        """Return one row of the call table for each launch of a pass; None if the pass must be launched from Python.
+
+        Args:
+            step: The pass.
+            notes: Its recorded launches and copies.
+        """
         rows = []
         for note in notes:
             banded = note.rows is not None
             if step.rows is not None and note.rows != (0, step.rows) and note.arrays is None:
-                return None  # a launch over other rows than those of its split pass
+                return None  # the launch does not cover exactly the rows of the pass, so it cannot be split with it
             if note.arrays is not None:
                 target, source = note.arrays
                 if not (target.is_contiguous and source.is_contiguous and target.shape == source.shape):
@@ -249,8 +255,8 @@ class CpuThreads:
         self._caller = self._serve(1)
         self._helpers = [self._serve(0) for _ in range(self._count - 1)]
         self._end = weakref.finalize(self, _stop, self._state, self._system, self._count)
-        # Not at Python's exit: threads that are woken then would be unwound through native code, which aborts the
-        # process. Sleeping threads end with the process.
+        # The threads are not stopped at Python's exit. A thread that was woken then would be unwound through native
+        # code, which aborts the process; a sleeping thread ends with the process.
         self._end.atexit = False
 
     def _serve(self, caller: int) -> _Packed:
@@ -259,7 +265,7 @@ class CpuThreads:
         return _Packed(wp.launch(bands.serve_kernel, 1, inputs, [out], device="cpu", record_cmd=True))
 
     def _call_back(self, number: int) -> int:
-        """Run the step with index ``number`` in Python, on the calling thread; return 1 if it failed, else 0."""
+        """Run host step ``number`` in Python, on the thread that calls; return 1 if it failed, else 0."""
         try:
             self._host_steps[number]()
         except BaseException as error:  # raised again on the thread that runs the frame
@@ -270,13 +276,16 @@ class CpuThreads:
     # ---- one frame ------------------------------------------------------------------------------------------------
 
     def run(self, due: Sequence[tuple[Stage, list[Pass]]]) -> Mapping[str, float]:
-        """Run a frame, with this thread as one of the threads; return nanoseconds of all threads by stage.
+        """Run a frame, with this thread as one of the threads.
 
         Args:
-            due: Stages to run, with their passes that take part.
+            due: Stages to run, with those of their passes that take part.
+
+        Returns:
+            Nanoseconds by stage, summed over all threads.
 
         Raises:
-            BaseException: First error of a step in Python; work in progress has ended.
+            BaseException: Error of a step in Python; no thread works on the frame any more.
         """
         for column in (self._start, self._stop, self._time):
             column[:] = 0
@@ -289,9 +298,9 @@ class CpuThreads:
         self._state[0, self._open] = len(self._names)
         self._state[0, self._has_failed] = 0
         if len(self._threads) < len(self._helpers):
-            # The owner may be garbage collected without having been closed, so each thread holds all data that it reads
-            # until it returns. It does not hold the callback, which refers to the owner and is called only during
-            # frames.
+            # This object may be garbage collected without having been closed, so each thread refers to all data that it
+            # reads until it returns. It does not refer to the callback, which refers to this object and is called only
+            # during frames.
             read = (self._state, self._stages, self._passes, self._calls, self._readers, self._system)
             self._threads = [threading.Thread(target=_serve, args=(one, read), daemon=True) for one in self._helpers]
             for thread in self._threads:
@@ -308,7 +317,7 @@ class CpuThreads:
         return dict(zip(self._names, times.tolist(), strict=True))
 
     def close(self) -> None:
-        """End the threads, and release the references of the tables to the scheduler, which refers to this object."""
+        """End the threads, and release the tables, which refer to the scheduler and it to this object."""
         self._end()
         for thread in self._threads:
             thread.join()
@@ -320,7 +329,7 @@ def _serve(helper: _Packed, read: tuple[Any, ...]) -> None:
 
     Args:
         helper: The launch of ``serve_kernel``.
-        read: Data that the thread reads, held until it returns.
+        read: Data that the thread reads; this reference keeps it alive until the thread returns.
     """
     helper.call()
     del read

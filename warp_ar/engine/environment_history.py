@@ -1,4 +1,4 @@
-"""Memory of the environment's light from frame to frame, and from one pipeline to the next."""
+"""Light of the environment that is kept from frame to frame, and from one pipeline to the next."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from warp_ar.kernels.structs import struct_values
 from warp_ar.stages.base import Arrays
 
 KEPT_ARRAYS = ("others_kept_radiance", "others_filled")
-"""Arrays with the remembered radiance of the second and further mirror balls, copied to a new pipeline by stages."""
+"""Arrays with the kept radiance of the second and further mirror balls, before and after holes are filled."""
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """Arrays of the environment that ``CarriedLight.take_over`` resamples into a new pipeline."""
 SCALED_ARRAYS = ("environment_radiance", "filled_radiance", "recover_recovered", *KEPT_ARRAYS)
-"""Arrays of radiance that persist between frames; ``filled_radiance`` does so only while something covers a ball."""
+"""Arrays of radiance that are kept between frames; ``filled_radiance`` is kept only while something covers a ball."""
 
 
 class CarriedLight:
-    """Environment that a pipeline has captured so far; ``known`` tells whether there is any."""
+    """Environment that a pipeline has captured so far; ``known`` is False before the first."""
 
     def __init__(self, arrays: Arrays, *, wanted: bool) -> None:
-        """Take the pipeline's arrays; ``wanted``: the environment is one of the outputs."""
+        """Store the pipeline's arrays; ``wanted`` is True if the environment is one of the outputs."""
         self._arrays, self._wanted = arrays, wanted
         self.known = False
-        """True if the arrays hold light; otherwise the next frame starts without any."""
+        """True if the arrays hold light; if not, the next frame discards their content."""
 
     @property
     def environment(self) -> Any:
-        """Return the environment for the results; None if it is no output or has not been seen yet."""
+        """Return the environment for the results; None if it is not an output or has not been captured yet."""
         return self._arrays["environment"] if self.known and self._wanted else None
 
     @property
@@ -41,7 +41,7 @@ class CarriedLight:
         return self._arrays.get("others_environment") if self.environment is not None else None
 
     def scale(self, ratio: npt.NDArray[np.float64]) -> None:
-        """Scale remembered radiance to the camera values of a changed camera gain.
+        """Scale the kept radiance after a change of the camera's gain, so that it fits the values of the next frame.
 
         Args:
             ratio: New gain over old gain, RGB.
@@ -84,7 +84,7 @@ def resample_light(
     clipped: npt.NDArray[np.float32],
     shape: tuple[int, int],
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return the remembered light at another size, by means weighted with confidence.
+    """Return captured light resampled to another size, as means weighted with confidence.
 
     Args:
         radiance: Latlong (h, w, 3), camera values.

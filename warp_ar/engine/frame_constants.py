@@ -1,7 +1,7 @@
 """Values that change per frame, in one block of memory: camera, virtual lights, virtual objects, proxies.
 
-The host writes the block and uploads it in one copy, so that a captured CUDA graph reads new values without a new
-capture. The copy is asynchronous, from pinned memory that is not overwritten before the copy is done.
+The host writes the block and uploads it in one copy to a fixed address. A CUDA graph therefore reads new values without
+being captured again. The copy is asynchronous, from pinned memory that is not overwritten before the copy is done.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from warp_ar.device import wait_for
 from warp_ar.kernels.structs import FrameParams, Light, Shape, struct_dtype
 
 _ALIGNMENT = 16
-_SLOTS = 4  # uploads that may be in progress
+_SLOTS = 4  # largest number of uploads in progress
 
 
 class FrameBlock:
-    """Typed host views of one buffer, and device arrays that alias its uploaded copy."""
+    """Block of memory, as typed NumPy views on the host and as Warp arrays of its uploaded copy on the device."""
 
     def __init__(self, device: Any, lights: int, objects: int, proxies: int = 0) -> None:
         """Allocate the block.

@@ -1,11 +1,11 @@
-"""Selection of the stages that can change a pixel of the current frame, and the reasons against the others.
+"""Selection of the stages that can change a pixel of the current frame, with a reason for each of the others.
 
 A plan depends on the scene, not on the frame: in a frame a light may have no power, or an object may be out of view.
-Before a frame, each stage states whether its output has no effect (``Stage.idle``). Stages are examined from the
-outputs backwards, because the inputs of an idle stage are not needed for it. The arrays of an idle stage must hold its
-neutral output: in its first idle frame the stage runs once more to clear them, and then it rests. A stage whose output
-no running stage reads rests as well. Its arrays keep their version, so it runs again in the next frame that needs it if
-its inputs have changed meanwhile.
+Before a frame, each stage states whether it is idle, that is, whether its output has no effect (``Stage.idle``). Stages
+are examined from the outputs backwards, because an idle stage needs no inputs. The arrays of an idle stage must hold
+its neutral output. In its first idle frame the stage therefore runs once more to clear them; in the following ones it
+rests, that is, it does not run. A stage whose output no running stage reads also rests. The version of its arrays does
+not change. In the next frame that needs it, it runs only if its inputs have changed.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from warp_ar.stages.base import Reach, Stage
 
 
 class FrameCulling:
-    """Examines a plan's stages before every frame; remembers the stages whose arrays hold their neutral output."""
+    """Selection of a plan's stages before every frame; stores which stages' arrays are clear (hold neutral output)."""
 
     def __init__(self, stages: Sequence[Stage], outputs: Collection[str]) -> None:
-        """Prepare for a plan, none of whose arrays is clear yet.
+        """Store a plan's stages; no array is clear yet.
 
         Args:
             stages: Stages of the plan, in the order in which they run.
-            outputs: Resources that the caller wants in every frame.
+            outputs: Resources that every frame must provide.
         """
         self._stages, self._outputs = stages, outputs
         self._clear: set[str] = set()
         self._last: tuple[Reach, Mapping[str, str]] | None = None
-        """Reach and result of the last frame, valid for the next with the same reach; None after clearing."""
+        """Reach and resting stages of the last frame, valid for the next frame if its reach is equal; None if stages
+        were cleared in the last frame."""
 
     def forget(self) -> None:
-        """Treat no stage's arrays as clear (holding their neutral output)."""
+        """Assume that no stage's arrays are clear."""
         self._clear.clear()
         self._last = None
 

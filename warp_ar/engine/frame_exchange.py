@@ -1,8 +1,9 @@
 """Frames in the memory of other libraries: objects with ``__dlpack__`` or ``__cuda_array_interface__``.
 
-A frame on the pipeline's CUDA device is read in place. The device waits for the producer's stream as the protocol
-states: a DLPack producer is told the reading stream, and ``__cuda_array_interface__`` names the writing stream. The
-frame is referenced until the kernels have read it, so that its owner does not reuse the memory meanwhile.
+A frame on the pipeline's CUDA device is read without a copy. The device waits until the library that made the frame,
+its producer, has written it: a DLPack producer is told the reading stream, and ``__cuda_array_interface__`` names the
+writing stream. The frame is referenced until the kernels have read it, so that its owner does not reuse the memory
+meanwhile.
 
 References:
     Python array API standard, ``__dlpack__``; Numba, CUDA Array Interface, version 3.
@@ -31,9 +32,9 @@ def adopt_frame(image: Any, size: tuple[int, int], device: Any) -> npt.NDArray[n
     """Return a frame of any supported kind as an array that the pipeline can read.
 
     Args:
-        image: uint8 RGB (height, width, 3) of NumPy or with ``__dlpack__`` or ``__cuda_array_interface__``, or a Warp
-            array (height, width) of ``wp.vec3ub``.
-        size: Width and height.
+        image: uint8 RGB (height, width, 3) as a NumPy array or an object with ``__dlpack__`` or
+            ``__cuda_array_interface__``, or a Warp array (height, width) of ``wp.vec3ub``.
+        size: Width and height of the pipeline's frames.
         device: Device of the pipeline.
 
     Returns:
@@ -110,7 +111,18 @@ def _from_cuda(image: Any, size: tuple[int, int], device: Any, kind: str) -> Any
 def _check_strides(
     kind: str, dtype: np.dtype[Any], shape: tuple[int, ...], strides: tuple[int, ...] | None, size: tuple[int, int]
 ) -> None:
-    """Check that a device array holds a frame with three adjacent bytes per pixel; raise UsageError otherwise."""
+    """Check that an array on the device holds a frame with three adjacent bytes per pixel.
+
+    Args:
+        kind: Name of the frame's type in messages.
+        dtype: Type of the array's elements.
+        shape: Shape of the array.
+        strides: Strides of the array in bytes; None: contiguous.
+        size: Width and height of the pipeline's frames.
+
+    Raises:
+        UsageError: The array has another size, type or layout.
+    """
     expected = (size[1], size[0], 3)
     if tuple(shape) != expected or dtype != np.uint8:
         raise UsageError(f"frame is {kind} {dtype} {tuple(shape)}; expected uint8 RGB {expected}")
@@ -119,14 +131,14 @@ def _check_strides(
 
 
 class Borrowed:
-    """References to frames of other libraries that kernels are still reading."""
+    """References to frames in the memory of other libraries, which kernels are still reading."""
 
     def __init__(self, device: Any) -> None:
         self._device = device
         self._kept: collections.deque[tuple[Any, Any]] = collections.deque()
 
     def keep(self, frame: Any) -> None:
-        """Hold a frame until the work launched so far is done, and release frames whose work is done."""
+        """Refer to a frame until the kernels launched so far are done; release frames whose kernels are done."""
         if not self._device.is_cuda:
             return
         with exclusive(self._device):

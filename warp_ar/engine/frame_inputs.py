@@ -40,27 +40,32 @@ _CLOCK = struct.Struct("<2fi")
 _ALL_RECTS = ("object", "light", "direct", "shadow", "ball")
 """Names of the screen rectangles, in their order in the frame constants."""
 RECTS = ("object", "light", "shadow", "ball")
-"""Screen rectangles that limit the rows of passes; the frame constants hold them with their columns."""
+"""Names of the screen rectangles that limit the rows of passes. The frame constants hold each rectangle's rows and
+columns."""
 
 
 @dataclasses.dataclass(slots=True)
 class SeenFrame:
-    """A frame whose pose has been found, before it is rendered."""
+    """Frame whose pose has been found, before it is rendered."""
 
     image: Any
     """Image of the caller, or a copy of it."""
     slot: Slot | None
     """Slot of ``Transfers`` that holds the image, if the transfer to the device has begun; else None."""
     pose: Pose | None
+    """``camera_from_world``; None if lost or not needed."""
     lost: bool
+    """True if a pose is needed but unknown."""
     index: int
+    """Number of frames before this one since the arrays were allocated."""
     time: float
     """Time of the frame on the caller's clock, seconds."""
     seconds: float
-    """Seconds since the first frame."""
+    """Seconds since the start of animations, which is the first frame or the time given to ``start_clock``."""
     step: float
     """Seconds since the previous lit frame."""
     timings: dict[str, StageTiming]
+    """Time of tracking."""
     places: Places = dataclasses.field(default_factory=dict)
     """Poses of the markers to which objects, lights or other parts of the scene are attached."""
     deep: DeepFrame | None = None
@@ -68,7 +73,7 @@ class SeenFrame:
 
 
 class FrameInputs:
-    """Inputs of the stages: written before a frame is rendered, and marked if they changed."""
+    """Inputs of the stages. They are written before a frame is rendered; those that changed get a new version."""
 
     def __init__(
         self,
@@ -88,10 +93,10 @@ class FrameInputs:
             camera: Camera of the frames.
             arrays: Arrays of the pipeline, empty.
             device: Warp device, the current one.
-            follows_gain: Whether to follow a drift of the camera's exposure and white balance.
-            watches_ball: Whether to detect frames in which something covers a ball, and to estimate the balls'
+            follows_gain: True to estimate drifts of the camera's exposure and white balance.
+            watches_ball: True to detect frames in which something covers a ball, and to estimate the balls'
                 reflectance.
-            linear: Whether a stage reads frames as linear radiance.
+            linear: True if a stage reads frames as linear radiance.
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
@@ -110,9 +115,9 @@ class FrameInputs:
         self._linear_frame = wp.zeros(shape if linear else (0, 0), dtype=wp.vec3, device=device)
         self._linear_clip = wp.zeros(2, dtype=wp.vec3, device=device)
         self.decode = decode_table(camera.transfer)
-        """Linear value of each code, (256, 3)."""
+        """Linear value of each 8-bit code, (256, 3)."""
         self.saturation = SaturationLevels()
-        """Codes at which the channels saturate, estimated from the frames so far."""
+        """8-bit codes at which the channels saturate, estimated from the frames so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         watches_ball = watches_ball and scene.has_marker and bool(scene.probes)
         self._occlusion = BallOcclusion(scene, camera) if watches_ball else None
@@ -126,7 +131,7 @@ class FrameInputs:
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         self._written_rects: dict[str, Rect] = dict.fromkeys(_ALL_RECTS, EMPTY)
-        # Views of every field, (1, ...): looking a field up by name takes NumPy longer than writing it.
+        # A view of every field, (1, ...), is kept, because NumPy takes longer to look a field up by name than to write.
         values = self.block.host("params")
         self._params = {name: values[name] for name in values.dtype.names}
         self._all_rects = values.view(np.uint8)[values.dtype.fields[f"{_ALL_RECTS[0]}_rect"][1] :].view(np.int32)
@@ -166,7 +171,7 @@ class FrameInputs:
 
     @property
     def told_reflectance(self) -> tuple[scenes.RGB, ...] | None:
-        """Reflectance of the balls estimated from frames; None while the scene's values are used."""
+        """Reflectance of each ball, RGB, estimated from frames; None while the scene's values are used."""
         told = self._reflectance
         return None if told is None or not told.is_told else told.values
 
@@ -179,8 +184,8 @@ class FrameInputs:
         """Update the estimates of the camera's gain and of the balls' reflectance, if the frame is on the host.
 
         Returns:
-            Ratio of the gain to the previous one, RGB, None if unchanged; and True if the estimated tone curve or a
-            ball's reflectance changed, which invalidates the light of former frames.
+            Ratio of the new gain to the previous one, RGB, or None if it is unchanged; and True if the estimated tone
+            curve or a ball's reflectance has changed, so that the light of earlier frames must be discarded.
         """
         if frame.pose is None or isinstance(frame.image, wp.array):
             return None, False
@@ -188,7 +193,12 @@ class FrameInputs:
         return ratio, self._note_reflectance(frame, frame.pose) or is_bent
 
     def _look_for_drift(self, frame: SeenFrame, pose: Pose) -> tuple[npt.NDArray[np.float64] | None, bool]:
-        """Update the estimate of the camera's gain and tone curve; return the two values that ``look`` describes."""
+        """Update the estimates of the camera's gain and tone curve.
+
+        Returns:
+            Ratio of the new gain to the previous one, RGB, or None if it is unchanged; and True if the tone curve has
+            changed.
+        """
         if self._drift is None:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
@@ -209,7 +219,7 @@ class FrameInputs:
             self._write_decode()
         own, theirs = self._occlusion, other._occlusion
         if own is not None and theirs is not None and own.watches == theirs.watches:
-            self._occlusion = copy.copy(theirs)  # shallow: members are replaced, not modified
+            self._occlusion = copy.copy(theirs)  # a shallow copy suffices: members are replaced, not modified
         mine, yours = self._reflectance, other._reflectance
         if mine is not None and yours is not None and mine.watches == yours.watches:
             self._reflectance = copy.deepcopy(yours)
@@ -222,7 +232,7 @@ class FrameInputs:
             self._write_decode()
 
     def forget_drift(self) -> None:
-        """Restart the estimate of the gain: the next frame is its first."""
+        """Restart the estimate of the camera's gain; it becomes relative to the next frame."""
         if self._drift is None:
             return
         is_bent = self._drift.contrast != 0.0
@@ -232,7 +242,7 @@ class FrameInputs:
             self._write_decode()
 
     def _write_decode(self) -> None:
-        """Write the decoding table for the camera's current estimates."""
+        """Write the tables that decode and encode pixel values, by the estimated saturation and tone curve."""
         contrast, levels = 0.0 if self._drift is None else self._drift.contrast, self.saturation.levels
         self._arrays["decode"].assign(camera_table(self._camera.transfer, levels, contrast))
         if contrast != self._encoded[0] or (contrast != 0.0 and (levels != self._encoded[1]).any()):
@@ -256,8 +266,8 @@ class FrameInputs:
 
         Args:
             scene: Scene with the same skeleton.
-            placed: Whether objects or lights differ.
-            exposed: Whether the exposure differs.
+            placed: True if objects or lights differ.
+            exposed: True if the exposure differs.
         """
         if exposed:
             self.write_exposure(scene)
@@ -267,23 +277,25 @@ class FrameInputs:
             self._arrays.touch("objects")
 
     def write_exposure(self, scene: Scene) -> None:
-        """Write the scale of the exposure; ``auto`` computes it on the device."""
+        """Write the scale of the exposure, or 1 for ``auto``, which is computed on the device."""
         scale = scene.exposure.scale
         self._params["exposure_scale"][0] = 1.0 if isinstance(scale, str) else scale
         self._arrays.touch("exposure")
 
     def write(self, frame: SeenFrame, *, reset: bool) -> None:
-        """Write the inputs for ``frame``: its constants, then its picture, which ``receive`` copies on the device.
+        """Write the inputs for a frame: its constants, then its picture.
+
+        A picture that is in transfer to the device is copied into the stages' array later, by ``receive``.
 
         Args:
-            frame: Frame with a tracked or held marker.
-            reset: Whether the accumulated environment is discarded.
+            frame: Frame whose pose is not lost.
+            reset: True if the accumulated environment is discarded.
         """
-        self._coming = None  # left by a frame that failed before it was received
+        self._coming = None  # a frame that failed before it was received may have left a slot
         touched = ["clock", *self._place_probes(frame)]
         self.covered = self._is_covered(frame, reset=reset)
         if not self.covered:
-            self._note_saturation(frame)  # before the lights are written, whose unit depends on it
+            self._note_saturation(frame)  # must precede the lights, whose unit depends on the saturation
         touched += self._place(frame)
         if (frame.pose is not None and self._move(frame.pose)) or self._arrays.version("pose") == 0:
             touched.append("pose")
@@ -303,7 +315,7 @@ class FrameInputs:
         self._write_decode()
 
     def _is_covered(self, frame: SeenFrame, *, reset: bool) -> bool:
-        """Return True if something covers a ball; False if the frame is not on the host."""
+        """Return True if something covers a ball; always False for a frame that is not on the host."""
         if self._occlusion is None or frame.pose is None or isinstance(frame.image, wp.array):
             return False
         if reset:
@@ -376,7 +388,11 @@ class FrameInputs:
         return before != (position.tobytes(), rotation.tobytes())
 
     def _outlines(self) -> dict[str, Outline]:
-        """Return the outlines to project onto the screen; ``light`` only if bounced light extends ``direct``."""
+        """Return the outlines in the world to project onto the screen, by the names of their rectangles.
+
+        ``direct`` bounds the direct light of virtual lights. ``light`` is included only if bounced light reaches
+        further.
+        """
         scene, arrays = self.host_scene, self._arrays
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
         if "relight_bounced" in arrays:
@@ -399,7 +415,7 @@ class FrameInputs:
         return Reach(objects=objects, shines=self._shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def radiance(self, deep: DeepFrame) -> npt.NDArray[np.float32]:
-        """Return a deep frame as linear radiance by the estimated tone curve, in a new array."""
+        """Return a deep frame as linear radiance in a new array, (height, width, 3), by the estimated tone curve."""
         contrast = 0.0 if self._drift is None else self._drift.contrast
         if contrast == 0.0 or deep.picture.dtype != np.uint16:
             return deep.radiance(str(self._camera.transfer))
@@ -410,7 +426,7 @@ class FrameInputs:
         return decode_deep(deep.picture, self._bent_table)
 
     def linear(self, deep: DeepFrame) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        """Return the linear radiance of a deep frame and its levels of clipping."""
+        """Return the linear radiance of a deep frame, and its ``clip_levels``, (2, 3)."""
         return self.radiance(deep), deep.clip_levels(str(self._camera.transfer), self.saturation.levels)
 
     def _take_deep(self, frame: SeenFrame) -> bool:
@@ -430,7 +446,7 @@ class FrameInputs:
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; return False if it equals the previous one, so that its readers need not run."""
         if frame.slot is not None:
-            self._coming = frame.slot  # received as late as possible, so that the transfer overlaps with other work
+            self._coming = frame.slot  # ``receive`` waits for it as late as possible, so that transfer and work overlap
         elif isinstance(frame.image, wp.array):
             wp.copy(self.frame, frame.image)
         else:
@@ -442,7 +458,12 @@ class FrameInputs:
 
 
 def _probe_values(probes: Sequence[scenes.Probe], reflectances: Sequence[scenes.RGB] | None = None) -> npt.NDArray[Any]:
-    """Return the kernels' records of the balls; with ``reflectances`` None they hold the scene's reflectances."""
+    """Return records of the balls for kernels, (n,).
+
+    Args:
+        probes: The balls at their present places.
+        reflectances: Reflectance of each ball; None: the scene's.
+    """
     values = np.zeros(len(probes), struct_dtype(Probe))
     told = [probe.reflectance for probe in probes] if reflectances is None else reflectances
     for value, probe, reflectance in zip(values, probes, told, strict=True):

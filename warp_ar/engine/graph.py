@@ -1,6 +1,6 @@
-"""Planning: from a request to the stages that must run, in order, with a reason for each that does not.
+"""Planning: from a request to the stages that must run, in order, with a reason for each stage that does not.
 
-Planning is pure Python: it reads the scene and the quality, and uses neither Warp nor a frame.
+Planning reads the scene and the quality. It uses neither Warp nor a frame.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ class Plan:
     features: Features
     """Features of the request."""
     stages: tuple[tuple[type[Stage], Wiring], ...]
+    """Stages, each with the resources that it reads and writes."""
     left_out: tuple[tuple[str, str], ...]
     """Pairs (stage, reason) of the stages that do not run."""
     inputs: tuple[str, ...]
@@ -35,13 +36,16 @@ class Plan:
         return self.features.request
 
     def needs(self, name: str) -> bool:
-        """Return True if a stage reads the input ``name``, or it is an output."""
+        """Return True if the input ``name`` is an output or is read by a stage."""
         return name in self.inputs
 
 
 @checked
 def make_plan(request: Request) -> Plan:
-    """Wire the stages that the request needs, then drop those whose outputs are not used, from the outputs backwards.
+    """Return the plan of a request.
+
+    Each stage states the resources that it reads and writes. Stages whose outputs nothing reads are then dropped, from
+    the request's outputs backwards.
 
     Raises:
         ValueError: No stage produces an output, or a stage reads a resource that no earlier stage writes.

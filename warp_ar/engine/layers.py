@@ -1,4 +1,4 @@
-"""Layers of the picture among a pipeline's outputs: on the device, on the host, and without a marker."""
+"""Layers of the picture, such as depth, as outputs of a pipeline: on the device, on the host, and without a marker."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from warp_ar.stages.base import Arrays
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS, Request
 
 RADIANCE = "radiance"
-"""Output that requests the five layers of the picture, so that ``Result.radiance`` is available."""
+"""Name of an output that stands for the five layers from which ``Result.radiance`` composes the picture."""
 OUTPUTS = ("image", "environment", "pose", RADIANCE)
 """Outputs that are not layers."""
 
 _COMPONENTS = {"objects": 4, "coverage": 8, "motion": 2, "ids": 0, "depth": 0}
-"""Components per pixel of a layer, by name; 0: a scalar array. Layers that are not listed have three."""
+"""Number of components per pixel of layers, by name; 0 stands for an array (height, width). Other layers have three."""
 
 
 def check_outputs(outputs: Sequence[str]) -> None:
@@ -51,10 +51,11 @@ class LayerArrays:
     def with_plate(self, radiance: npt.NDArray[np.float32], clip: npt.NDArray[np.float32]) -> LayerArrays:
         """Return the layers with the plate, the frame before anything virtual, at its full bit depth.
 
-        Channels that clip take the larger of ``radiance`` and the layer, in which clipped values are estimated.
+        In channels that clip, the plate is the larger of ``radiance`` and the present layer, which estimates clipped
+        values.
 
         Args:
-            radiance: Plate at full depth, (height, width, 3).
+            radiance: Linear radiance of the frame at full bit depth, (height, width, 3).
             clip: Radiance at which each channel clips, (3,).
         """
         if "plate" not in self.arrays:
@@ -85,10 +86,14 @@ def expand_outputs(outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def compose_layers(layers: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
-    """Return the picture's linear radiance, (height, width, 3), from five layers, before the exposure's scale."""
+    """Return the picture's linear radiance, (height, width, 3), composed of five layers and not scaled by the exposure.
+
+    Args:
+        layers: Arrays of the layers, by name.
+    """
     physical = layers["plate"] * layers["shadow_ratio"] + layers["added_light"] + layers["mirror_ball"]
     objects = layers["objects"]
-    # A plate in wide primaries may be negative; pixels that nothing is laid over keep that value.
+    # Wide primaries may make the plate negative. Pixels without virtual content keep such values.
     laid = (layers["shadow_ratio"] != 1.0) | (layers["added_light"] != 0.0) | (layers["mirror_ball"] != 0.0)
     physical = np.where(laid, np.maximum(physical, 0.0), physical)
     picture: npt.NDArray[np.float32] = (1.0 - objects[..., 3:]) * physical + objects[..., :3]
@@ -107,7 +112,7 @@ def neutral_layers(request: Request, frame: Any, decode: npt.NDArray[np.float32]
     Args:
         request: Request with the names of the layers.
         frame: The frame, uint8 RGB (height, width, 3), or a Warp array of it.
-        decode: Linear value of each code, (256, 3).
+        decode: Linear value of each 8-bit code, (256, 3).
     """
     width, height = request.size
     found: dict[str, Any] = {}

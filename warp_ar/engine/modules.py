@@ -1,7 +1,7 @@
 """Parallel compiling and loading of a plan's modules, with progress.
 
-Warp translates Python in one thread at a time. Its compilers, Clang and NVRTC, run in parallel with each other and with
-the translation.
+Warp translates Python to C++ in one thread at a time. Its compilers, Clang and NVRTC, run in parallel with each other
+and with the translation.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from warp_ar.device import compiling, exclusive, usable_cores
 from warp_ar.errors import UsageError
 
 Progress = Callable[[int, int], None]
-"""Receives the number of compiled modules and of all that must be compiled, first 0; not called if none must be."""
+"""Function to which the number of compiled modules, first 0, and the number of all modules to compile are passed. It is
+not called if there are none."""
 
 _Variant = tuple[Any, str, int | None]
 """Module, name of its device, and block size; None means the usual size."""
@@ -39,22 +40,26 @@ def load_modules(
     Args:
         kernels: Kernels of a plan, in the order of its stages.
         device: Warp device.
-        progress: Called on the caller's thread after each module that was compiled.
-        blocks: Kernels that CUDA runs with another block size than the usual one, each with that size.
+        progress: Function that is called on this thread after each compiled module.
+        blocks: Kernels that CUDA runs with another block size than their module's, each with that size.
     """
     found: dict[_Variant, None] = dict.fromkeys((kernel.module, str(device), None) for kernel in kernels)
     found |= dict.fromkeys((kernel.module, str(device), size) for kernel, size in blocks)
     with compiling():
         missing = [variant for variant in found if not _is_cached(variant)]
         if missing:
-            # The last stages have the longest kernels. If they were started last, one would run alone on one thread.
+            # The last stages take longest to compile. If they were started last, all but one core would wait for them.
             _compile(missing[::-1], progress)
         for variant in found:
             _load(variant)
 
 
 def _compile(variants: list[_Variant], progress: Progress | None) -> None:
-    """Compile modules into the cache, in as many threads as there are cores."""
+    """Compile modules into the cache, in as many threads as there are cores.
+
+    Raises:
+        UsageError: The cache cannot be written.
+    """
     if progress is not None:
         progress(0, len(variants))
     pool = _compilers(os.getpid())
@@ -73,7 +78,7 @@ def _compile(variants: list[_Variant], progress: Progress | None) -> None:
                 progress(done, len(variants))
     finally:
         for job in jobs:
-            job.cancel()  # after an interrupt, do not wait for the others
+            job.cancel()  # after an interrupt, jobs that have not begun are not waited for
 
 
 @functools.cache
@@ -85,7 +90,7 @@ def _compilers(process: int) -> ThreadPoolExecutor:
 def _compile_one(variant: _Variant) -> None:
     module, device, size = variant
     if device != "cpu" and size is None:
-        wp.compile_aot_module(module, device=device)  # without the device's lock, so that other pipelines' frames go on
+        wp.compile_aot_module(module, device=device)  # does not need the device's lock, so other pipelines can run
     else:
         _load(variant)
 
@@ -97,13 +102,13 @@ def _load(variant: _Variant) -> None:
         try:
             wp.load_module(module, device=device, block_dim=size)
         except Exception:
-            # Warp raises the loader's error, of no common class: the file may be truncated, empty or random bytes.
+            # Warp passes on the loader's error, of any class, if the file is truncated, empty or of random bytes.
             if not _folder_of(variant).exists():
                 raise
             folder = _folder_of(variant)
             shutil.rmtree(folder, ignore_errors=True)
             with contextlib.suppress(OSError):
-                folder.unlink()  # a file may have the folder's name
+                folder.unlink()  # removes a file in the folder's place
             if folder.exists():
                 raise
             wp.load_module(module, device=device, block_dim=size)
@@ -116,5 +121,5 @@ def _folder_of(variant: _Variant) -> Path:
 
 
 def _is_cached(variant: _Variant) -> bool:
-    """Return True if the cache has a module's files; this hashes the module, which loading needs anyway."""
+    """Return True if the cache has a module's files; the module is hashed for it, which loading needs anyway."""
     return bool(wp.config.cache_kernels) and _folder_of(variant).is_dir()

@@ -50,7 +50,7 @@ from warp_ar.tracking.tracking import OwnMarkers, Places, Track, Tracker, TrackS
 __all__ = ["DEFAULT_FRAME_INTERVAL", "TRACK", "Pipeline", "Result", "resolve_quality"]
 
 AHEAD = 2
-"""Submitted frames that may wait to be rendered."""
+"""Largest number of submitted frames that wait to be rendered."""
 
 DEFAULT_FRAME_INTERVAL = 1.0 / 30.0
 """Seconds between frames for which the caller gives no time."""
@@ -91,7 +91,7 @@ def _in_turn(method: Callable[Concatenate[Pipeline, _P], _R]) -> Callable[Concat
 
     @functools.wraps(method)
     def call(self: Pipeline, /, *arguments: _P.args, **named: _P.kwargs) -> _R:
-        # In a fork another thread may seem to hold the lock for ever.
+        # In a forked process the lock may be held by a thread that does not exist there.
         with self._turn if os.getpid() == self._process else contextlib.nullcontext():
             return method(self, *arguments, **named)
 
@@ -99,9 +99,9 @@ def _in_turn(method: Callable[Concatenate[Pipeline, _P], _R]) -> Callable[Concat
 
 
 class Pipeline(Closing):
-    """Lights the frames of one camera, one per call.
+    """Pipeline that lights the frames of one camera, one frame per call.
 
-    Arrays are allocated by the constructor, never while frames run.
+    The kernels' arrays are allocated by the constructor and by ``change``, never for a frame.
     """
 
     bracket: BracketPlan
@@ -146,14 +146,14 @@ class Pipeline(Closing):
                 waits for the estimate. ``delayed``: a fixed time later, the same in every run. ``real_time``, for live
                 cameras: as soon as a separate process has computed it; no frame waits, and pictures of two runs may
                 differ for some frames.
-            emitters: Whether ``take_light`` will pass the positions of the captured light's emitters.
-            follows_camera: Whether to estimate drifts of the camera's exposure and white balance, and its tone curve,
+            emitters: True if positions of emitters will be passed to ``take_light``.
+            follows_camera: True to estimate drifts of the camera's exposure and white balance, and its tone curve,
                 from successive frames; None: if the scene declares an automatic exposure. Light that dims equally on
                 all surfaces is then taken for a drift.
-            culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same either
-                way.
-            linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. Mirror balls,
-                surfaces and the layer ``plate`` use the full depth; markers are found in 8 bits.
+            culling: True to leave out, in each frame, the stages that can change none of its pixels; pictures do not
+                depend on it.
+            linear: True if frames have more than 8 bits: uint16 codes, or linear radiance as floats. Mirror balls,
+                surfaces and the layer ``plate`` use the full bit depth; markers are found in 8 bits.
 
         Raises:
             UsageError: An argument cannot be used.
@@ -187,8 +187,8 @@ class Pipeline(Closing):
         follows = self._follows_camera
         if follows is None:
             follows = self.scene.source is not None and self.scene.source.metering == "automatic"
-        # With several exposures the frames' exposure times give the gain; the paper takes frames as the camera saw
-        # them.
+        # With several exposures, the gain follows from the frames' exposure times. The paper's method, which keeps
+        # clipped light, has no estimate of the gain.
         return follows and self.quality.method("recover") != "clipped" and not self.plan.request.exposures
 
     def _start_over(self) -> None:
@@ -202,11 +202,11 @@ class Pipeline(Closing):
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
 
     def _build(self, arrays: Arrays, spare: Mapping[str, Any]) -> None:
-        """Allocate the plan's arrays and wire its stages.
+        """Allocate the plan's arrays and build the passes of its stages.
 
         Args:
-            arrays: Receives the new arrays.
-            spare: Former arrays that may be overwritten.
+            arrays: Collection to which the new arrays are added.
+            spare: Former arrays, by name, that may be reused and overwritten.
         """
         with translating(self.device), wp.ScopedDevice(self.device):
             self._allocate(arrays, spare)
@@ -234,7 +234,7 @@ class Pipeline(Closing):
         request = self.plan.request
         waits = self._running["profile"] or request.asks_for_layers or request.estimates == "synchronous"
         self._launches_here = self.inputs.transfers is not None and "image" in self._arrays and not waits
-        """True if the caller's thread launches submitted frames, which does not wait for the device."""
+        """True if the caller's thread launches the kernels of submitted frames, without waiting for the device."""
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
 
@@ -242,7 +242,7 @@ class Pipeline(Closing):
     def close(self) -> None:
         """Stop the worker threads. The arrays are freed once no ``Result`` refers to them."""
         if self._closed or os.getpid() != self._process:
-            return  # a fork has neither the threads nor the device
+            return  # a forked process has neither the threads nor the device
         self._closed = True
         if self._renderer is not None:
             self._renderer.shutdown()
@@ -329,7 +329,7 @@ class Pipeline(Closing):
         before = copy.copy(self)
         self.scene, self.camera, self.quality, self.plan = scene, scene.camera, quality, plan
         try:
-            # Memory that is new to the process takes long to fill, so former arrays are reused.
+            # Former arrays are reused, because memory that is new to the process takes long to fill.
             self._build(Arrays(self._scheduler.constants()), self._scheduler.spare())
         except BaseException as error:
             vars(self).update(vars(before))
@@ -393,7 +393,7 @@ class Pipeline(Closing):
         frame, the poses must be given as well.
 
         Args:
-            saturation: Codes at which the camera's channels saturate, (3,), if known; they apply to all later frames.
+            saturation: 8-bit codes at which the camera's channels saturate, (3,), for all later frames; None: unknown.
 
         Raises:
             UsageError: The scene's light comes from a mirror ball in the frames.
@@ -436,7 +436,7 @@ class Pipeline(Closing):
         Args:
             radiance: Linear RGB in the scene's axes, float32 (height, 2 height, 3), with the quality's
                 ``environment_height``; it is referenced, not copied.
-            emitters: Emitters with positions: the array ``emitters`` of a pipeline that found them; it is copied.
+            emitters: Emitters with positions, from ``Result.emitters``; they are copied.
 
         Raises:
             UsageError: The scene names no captured light, or the map has another size.
@@ -478,14 +478,14 @@ class Pipeline(Closing):
         return self._begin(image, time_seconds, pose, exposure_time, ahead=False)
 
     def new_frame(self) -> Image:
-        """Return memory into which a source can write a frame to ``submit``.
+        """Return an array into which a source can write a frame for ``submit``.
 
-        On CUDA the memory is pinned and the frame is sent from it; other frames are first copied to pinned memory. A
-        submitted frame must not be changed; request new memory for the next frame. Memory is reused when nothing refers
-        to it any more. Beyond 512 MB in use, ordinary memory is returned.
+        On CUDA its memory is pinned, and the frame is sent from it; other frames are first copied to pinned memory. A
+        submitted frame must not be changed; request a new array for the next frame. Memory is reused when nothing
+        refers to it any more. Beyond 512 MB of pinned memory, arrays have ordinary memory.
 
         Returns:
-            uint8 (height, width, 3), of any values; also after the pipeline has been closed.
+            uint8 (height, width, 3), of any values. It stays valid after the pipeline has been closed.
         """
         if self.inputs.transfers is not None:
             return self.inputs.transfers.new_frame()
@@ -500,13 +500,13 @@ class Pipeline(Closing):
         pose: Pose | Track | None = None,
         exposure_time: float | None = None,
     ) -> Result:
-        """Light one frame without waiting for it; the arguments are those of a call.
+        """Light one frame without waiting for the result; the arguments are those of ``__call__``.
 
-        This thread finds the marker. On CUDA it also sends and launches the frame, and the picture's transfer back is
-        started; on CPU another thread renders the frame. If the next frame is submitted before this result's image is
-        read, tracking, both transfers and the kernels overlap. Device arrays of a result are valid until the next frame
-        is rendered. An image that is not writable (``flags.writeable``) is assumed not to change: on CPU it is not
-        copied. On CUDA an image from ``new_frame`` is not copied.
+        This thread finds the marker. On CUDA it also starts the frame's transfer, the kernels and the picture's
+        transfer back. On CPU another thread renders the frame. If the next frame is submitted before this result's
+        image is read, tracking, both transfers and the kernels overlap. Device arrays of a result are valid until the
+        next frame is rendered. On CPU an image that is not writable (``flags.writeable``) is assumed not to change and
+        is not copied. On CUDA an image from ``new_frame`` is not copied.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=True)
 
@@ -519,7 +519,15 @@ class Pipeline(Closing):
         *,
         ahead: bool,
     ) -> Result:
-        """Find a frame's pose and render it: on this thread or, if ``ahead`` and on CPU, on another one."""
+        """Check a frame, find its pose and render it.
+
+        Args:
+            image: Frame in a form that ``__call__`` takes.
+            time_seconds: Time of the frame, or None.
+            given: Known pose or track, or None.
+            exposure_time: Exposure time in seconds, or None.
+            ahead: True to return without waiting for the result.
+        """
         self._check_usable()
         if time_seconds is not None:
             check_number("time_seconds", time_seconds)
@@ -560,7 +568,7 @@ class Pipeline(Closing):
         ahead: bool,
         deep: DeepFrame | None = None,
     ) -> Result:
-        """Render a frame with checked arguments."""
+        """Find the pose of a frame with checked arguments, and render it or, if ``ahead``, begin to."""
         host_image = image if isinstance(image, np.ndarray) else None
         if pose is None:
             pose = given_pose(self.scene.pose, self._begun)
@@ -588,12 +596,12 @@ class Pipeline(Closing):
         return frame
 
     def _hand_over(self, frame: SeenFrame) -> Future[Rendered]:
-        """Render a host frame asynchronously: launched by this thread on CUDA, run by another one on CPU."""
+        """Render a host frame asynchronously: this thread launches it on CUDA, another one runs it on CPU."""
         while len(self._ahead) >= AHEAD:
             self._ahead.popleft().result()
         frame = self._send(frame)
         if frame.lost or not self._launches_here:
-            # The caller may overwrite the image before it is rendered, unless the image is not writable.
+            # The caller may overwrite a writable image before it is rendered.
             if frame.slot is not None and "image" in self._arrays:
                 frame.image = frame.slot.host  # the slot is not reused before this frame is rendered: see ``AHEAD``
             elif frame.image.flags.writeable:
@@ -629,7 +637,7 @@ class Pipeline(Closing):
     def _track(
         self, image: Any, now: float, pose: Pose | Track | None, timings: dict[str, StageTiming]
     ) -> tuple[Pose | None, TrackState | None]:
-        """Find the marker, unless the pose is known or not needed."""
+        """Find the marker, unless the pose is known or not needed; return pose and state, and note the time."""
         if isinstance(pose, Track):
             return pose.pose, pose.state
         if self._tracker is None or pose is not None:
@@ -644,7 +652,7 @@ class Pipeline(Closing):
         return track.pose, track.state
 
     def _find_own_markers(self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]) -> Places:
-        """Find the markers to which objects, lights or other parts of the scene are attached."""
+        """Return the poses of the markers to which objects, lights or other parts of the scene are attached."""
         if not self._own_markers:
             return {}
         if isinstance(image, wp.array):
@@ -659,7 +667,7 @@ class Pipeline(Closing):
     def _look(
         self, image: Any, now: float, given: Pose | Track | None, deep: DeepFrame | None
     ) -> tuple[SeenFrame, TrackState | None]:
-        """Find the marker and advance the clock."""
+        """Find the pose of a frame and advance the clock; return the frame and the state of the track."""
         timings: dict[str, StageTiming] = {}
         pose, state = self._track(image, now, given, timings)
         lost = pose is None and (self._tracker is not None or isinstance(given, Track))
@@ -670,7 +678,7 @@ class Pipeline(Closing):
         return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places, deep), state
 
     def _render(self, frame: SeenFrame) -> Rendered:
-        """Run the stages on a frame."""
+        """Run the stages on a frame; a frame whose marker is lost becomes the picture without virtual content."""
         timings: Mapping[str, StageTiming] = frame.timings
         start = time.perf_counter()
         if not frame.lost:
@@ -685,7 +693,7 @@ class Pipeline(Closing):
                 self.inputs.write(frame, reset=not self._light.known)
                 timings = {**timings, **self._scheduler.run(self.inputs.receive)}
             self._light.known = True
-        # Without a marker the objects' places are unknown: the frame passes unlit, and the last light is kept.
+        # Without a marker the objects' places are unknown: the picture is the frame, and the light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
         layers = self._layers_of(frame.image if frame.lost else None)
         if layers is not None and frame.deep is not None:
@@ -705,7 +713,7 @@ class Pipeline(Closing):
         )
 
     def _layers_of(self, unlit: Any = None) -> LayerArrays | None:
-        """Return the requested layers; neutral ones for a frame that passes unlit."""
+        """Return the requested layers, or None; for a frame ``unlit``, which gets no virtual content, neutral ones."""
         request = self.plan.request
         if not request.asks_for_layers:
             return None
@@ -722,9 +730,17 @@ class Pipeline(Closing):
         given: Pose | Track | None,
         deep: DeepFrame | None,
     ) -> Result:
-        """Measure light from a frame of another exposure than the shown one; return the last shown picture.
+        """Measure light from a frame of another exposure than the shown one; the result has the last shown picture.
 
         The light is measured only if the plan has the stage ``bracket``, which merges exposures.
+
+        Args:
+            image: The frame, on host or device.
+            host_image: The frame if it is on the host, else None.
+            exposure: Index of its exposure in the bracket; None if it was left out.
+            now: Time of the frame, seconds.
+            given: Known pose or track, or None.
+            deep: The frame at full bit depth, or None.
         """
         timings: dict[str, StageTiming] = {}
         bright: Any = image

@@ -24,7 +24,7 @@ from warp_ar.stages.request import PICTURE_LAYERS
 from warp_ar.tracking.tracking import TrackState
 
 TRACK = "track"
-"""Name under which reports list the tracking of the marker, which runs on the host."""
+"""Name of the tracking of markers, which runs on the host, among the stages in timings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,14 +32,17 @@ class Rendered:
     """Output of the stages for one frame."""
 
     image_array: Any
+    """Lit frame, or the frame itself if the marker is lost; on device or host."""
     environment_array: Any
+    """Environment on the device; None if it is not an output or has not been captured yet."""
     stages: Mapping[str, StageTiming]
+    """Time of every stage, by name."""
     render_ms: float = 0.0
     """Milliseconds that the host took to run the stages (CPU) or to launch them (CUDA)."""
     layers: LayerArrays | None = None
-    """Requested layers, in the pipeline's memory or copied; None if none was requested."""
+    """Requested layers, in the pipeline's memory or copied to the host; None if none was requested."""
     image: Picture | Image | None = None
-    """Host picture, or its transfer to the host in progress; None if it was not sent ahead."""
+    """Picture on the host, or its transfer to the host in progress; None if neither was made."""
     environment: npt.NDArray[np.float32] | None = None
     """Host copy of the environment, if one was made."""
     others_array: Any = None
@@ -47,7 +50,7 @@ class Rendered:
     others: npt.NDArray[np.float32] | None = None
     """Host copy of ``others_array``, if one was made."""
     emitters_array: Any = None
-    """Emitters of the environment with positions, records of ``Emitter``; None: the quality does not find them."""
+    """Emitters of the environment with positions, records of ``Emitter``; None if the quality does not find them."""
     emitters: npt.NDArray[Any] | None = None
     """Host copy of ``emitters_array``, if one was made."""
 
@@ -65,7 +68,7 @@ class Rendered:
 
 
 def done_at_once(work: Callable[[], Rendered]) -> Future[Rendered]:
-    """Run ``work`` on this thread and return its outcome as a future; an error is raised when the result is read."""
+    """Run ``work`` on this thread and return its outcome as a completed future, which raises its error when read."""
     future: Future[Rendered] = Future()
     try:
         future.set_result(work())
@@ -76,15 +79,18 @@ def done_at_once(work: Callable[[], Rendered]) -> Future[Rendered]:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """Result of one frame. For a submitted frame, every attribute but ``pose`` and ``state`` waits for rendering."""
+    """Result of one frame.
+
+    ``pose``, ``state`` and ``shown`` are known at once. For a submitted frame, all other attributes wait for rendering.
+    """
 
     pose: Pose | None
     """Pose ``camera_from_world``; None while the marker is lost, or if no stage or output needs it."""
     state: TrackState | None
-    """State of the marker's track, tracked, held or lost; None if no stage or output needs the pose."""
+    """State of the marker's track: tracked, held or lost; None if a ``Pose`` was given, or no pose is needed."""
     _rendered: Future[Rendered]
     shown: bool = True
-    """False for a frame of another exposure than the shown one: it only measures light, and ``image`` is the previous
+    """False for a frame of another exposure than the shown one. It only measures light; ``image`` is then the previous
     picture."""
 
     @property
@@ -94,7 +100,7 @@ class Result:
 
     @property
     def environment_array(self) -> Any:
-        """Environment, latlong linear RGB (rows, columns); None if it is no output or has not been seen yet."""
+        """Environment, latlong linear RGB (rows, columns); None if it is not an output or has not been captured yet."""
         return self._rendered.result().environment_array
 
     @property
@@ -125,7 +131,7 @@ class Result:
 
     @functools.cached_property
     def environment(self) -> npt.NDArray[np.float32] | None:
-        """Environment as an independent NumPy array, float32 RGB (rows, columns, 3), of the first ball."""
+        """Environment at the first ball as an independent NumPy array, float32 RGB (rows, columns, 3)."""
         rendered = self._rendered.result()
         if rendered.environment is not None or rendered.environment_array is None:
             return rendered.environment
@@ -133,9 +139,9 @@ class Result:
 
     @functools.cached_property
     def environments(self) -> tuple[npt.NDArray[np.float32], ...]:
-        """Environment at each mirror ball between which light is interpolated; the first one is ``environment``.
+        """Environments at the mirror balls between which light is interpolated; the first one is ``environment``.
 
-        The tuple has one map if light is not interpolated, and is empty if there is no ``environment``.
+        The tuple has one map if light is not interpolated, and is empty if ``environment`` is None.
         """
         rendered = self._rendered.result()
         others = rendered.others
@@ -147,7 +153,8 @@ class Result:
     def emitters(self) -> npt.NDArray[Any] | None:
         """Emitters of the environment with their positions, as an independent array for ``Pipeline.take_light``.
 
-        None if the environment is no output or has not been seen yet, or if the quality does not find the positions.
+        None if the environment is not an output or has not been captured yet, or if the quality does not find the
+        positions.
         """
         rendered = self._rendered.result()
         if rendered.emitters is not None or rendered.emitters_array is None:
@@ -158,7 +165,7 @@ class Result:
 
     @property
     def layer_arrays(self) -> Mapping[str, Any]:
-        """Requested layers by name, in the pipeline's memory; on the device valid until the next call."""
+        """Requested layers by name, in the pipeline's memory; arrays on the device are valid until the next call."""
         layers = self._rendered.result().layers
         return {} if layers is None else layers.arrays
 
@@ -190,12 +197,12 @@ class Result:
 
     @property
     def exposure_scale(self) -> float:
-        """Factor from the radiance of the layers to the picture's; available if a layer was requested."""
+        """Factor from the radiance of the layers to that of the picture; 1 if no layer was requested."""
         scale = self._host_layers.scale
         return 1.0 if scale is None else float(scale[0])
 
     def _picture(self) -> Any:
-        """Return the lit frame on the device, or on the host if it was sent ahead or passed through unlit."""
+        """Return the lit frame on the device; on the host if it was transferred, or if the frame stayed unlit."""
         rendered = self._rendered.result()
         if rendered.image is not None or not isinstance(rendered.image_array, wp.array):
             return self.image
@@ -209,13 +216,13 @@ class Result:
         dl_device: tuple[int, int] | None = None,
         copy: bool | None = None,
     ) -> Any:
-        """Export the lit frame by DLPack, uncopied, for ``torch.from_dlpack(result)``: uint8 RGB (height, width, 3).
+        """Export the lit frame, uint8 RGB (height, width, 3), by DLPack without a copy: ``torch.from_dlpack(result)``.
 
-        The picture lies on the pipeline's device, and the next call overwrites it: clone it to keep it. For a submitted
-        frame, as in a ``Session``, it is the host's picture, which is not overwritten.
+        The picture is on the pipeline's device, and the next call overwrites it: clone it to keep it. For a submitted
+        frame, as in a ``Session``, the picture is on the host and is not overwritten.
 
         Args:
-            stream: Stream of the consumer, which waits on the device for the kernels, as the protocol states.
+            stream: Stream of the consumer; on the device it waits for the kernels.
             max_version: Largest DLPack version that the consumer reads.
             dl_device: Device that the consumer requests; it must be the picture's.
             copy: True if the consumer requests a copy, which is refused.
@@ -238,9 +245,9 @@ class Result:
 
     @property
     def __cuda_array_interface__(self) -> dict[str, Any]:
-        """Lit frame by the CUDA Array Interface, as by ``__dlpack__``; absent if the picture is not on a CUDA device.
+        """Lit frame by the CUDA Array Interface, without a copy; absent if the picture is not on a CUDA device.
 
-        It names Warp's stream, for which a reader of version 3 waits.
+        The interface names Warp's stream, for which a reader of version 3 waits.
         """
         picture = self._picture()
         if not isinstance(picture, wp.array):

@@ -1,4 +1,4 @@
-"""Access to the virtual objects of a running pipeline by name: to move, paint, add and remove them between frames."""
+"""Access to the virtual objects of a running pipeline by name, to move, paint, add and remove them between frames."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Edit: TypeAlias = Callable[[tuple[Object, ...]], Sequence[Object]]
 
 
 class SceneObjects:
-    """Objects of a pipeline's scene. Each edit takes effect with the next frame, as by ``Pipeline.change``."""
+    """Objects of a pipeline's scene. An edit is made by ``Pipeline.change`` and takes effect in the next frame."""
 
     def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None]) -> None:
-        """Take a function that returns the objects and one that edits them."""
+        """Store a function that returns the objects and one that edits them."""
         self._objects, self._edit = objects, edit
 
     def __repr__(self) -> str:
@@ -56,7 +56,7 @@ class SceneObjects:
         """Append an object and return it.
 
         Raises:
-            UsageError: ``item`` is no object, or its name is taken.
+            UsageError: ``item`` is not an ``Object``, or another object has its name.
             SceneError: A number is not finite, or a file cannot be used; the scene is unchanged.
         """
         if not isinstance(item, Object):
@@ -67,7 +67,7 @@ class SceneObjects:
         return self[item.name or len(self) - 1]
 
     def remove(self, key: str | int) -> None:
-        """Remove an object by its name or index; later objects move up.
+        """Remove an object by its name or index; the indices of later objects decrease by one.
 
         Raises:
             UsageError: No object, or more than one, has that name, or the index is out of range.
@@ -86,7 +86,7 @@ class SceneObject:
     __slots__ = ("_edit", "_key", "_objects")  # a misspelt attribute is an error
 
     def __init__(self, objects: Callable[[], tuple[Object, ...]], edit: Callable[[Edit], None], key: str | int) -> None:
-        """Take functions that return and edit the objects, and the key of this one."""
+        """Store functions that return and edit the objects, and the name or index of this one."""
         self._objects, self._edit, self._key = objects, edit, key
 
     def __repr__(self) -> str:
@@ -98,7 +98,7 @@ class SceneObject:
         """Description of the object in the scene; it can be replaced by any other ``Object``.
 
         Raises:
-            UsageError: The new value is no object, or its name is taken by another one.
+            UsageError: The new value is not an ``Object``, or another object has its name.
         """
         items = self._objects()
         return items[find(items, self._key)]
@@ -121,10 +121,12 @@ class SceneObject:
 
     @property
     def world_from_object(self) -> npt.NDArray[np.float64]:
-        """Affine transform before animation, (4, 4), metres, in the frame of the object's own marker if any.
+        """Affine transform without animation, (4, 4), metres.
+
+        If the object is attached to a marker of its own, that marker's frame takes the place of the world.
 
         Raises:
-            SceneError: The new value is no such matrix (``object_at``).
+            SceneError: ``object_at`` cannot represent the new value.
         """
         item, matrix = self.value, np.eye(4)
         rotation, matrix[:3, 3] = dataclasses.replace(item, animate=None).pose_at(0.0)

@@ -1,10 +1,10 @@
 """Execution of a plan: skips stages with unchanged inputs, splits CPU passes into bands of rows, times every stage.
 
 On CUDA the stages that must run are captured once as a graph and replayed; each set of stages has its own graph. In the
-graph a stage waits only for the stages whose output it reads and for those that it runs after. So short kernels, which
-leave most of the device idle, run concurrently with others. On CPU, native threads (see ``cpu_threads``) take rows of
-any stage whose inputs are ready, in the order of the plan. So no thread waits for a pass that cannot be split, or for
-the last rows of one that can.
+graph a stage waits only for the stages whose output it reads. Short kernels, which leave most of the device idle,
+therefore run concurrently with others. On CPU, native threads (see ``cpu_threads``) take rows of any stage whose inputs
+are ready, in the order of the plan. Therefore no thread waits for a pass that cannot be split, or for the last rows of
+a pass that can.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from warp_ar.kernels.launch import Note, noting
 from warp_ar.stages.base import Arrays, ArraySpec, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
-"""A stage and its passes that are launched."""
+"""Stage with those of its passes that are launched."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,16 +37,16 @@ class StageTiming:
     """Time of one stage in one frame."""
 
     milliseconds: float
-    """On CPU the frame's time in proportion to the stage's share of all threads' time. On CUDA, unless the pipeline
-    profiles, an equal share of the host's launch time."""
+    """On CPU, the frame's time multiplied by the stage's share of the threads' time. On CUDA, the stage's time on the
+    device if the pipeline profiles; else the host's launch time divided by the number of stages."""
     skipped: bool
     """True if the stage's inputs were unchanged, or it was left out of this frame."""
     left_out: str | None = None
-    """Reason that the stage could change no pixel of this frame; None if it could."""
+    """Reason for which the stage cannot change a pixel of this frame; None if it can."""
 
 
 class Scheduler:
-    """Runs the stages of one plan on one device."""
+    """Executor of the stages of one plan on one device."""
 
     def __init__(
         self,
@@ -67,8 +67,8 @@ class Scheduler:
             device: Warp device.
             bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA, wait for every frame and time each stage on the device; stages then run one by one.
-            culling: Whether stages that can change no pixel of a frame are left out of it.
-            spare: Arrays to reuse instead of new ones of the same name, shape and type.
+            culling: True to leave out, in each frame, the stages that can change none of its pixels.
+            spare: Former arrays by name, which are reused where shape and type fit.
         """
         self.plan = plan
         self.arrays = arrays
@@ -77,7 +77,7 @@ class Scheduler:
         self.bands = bands
         self._threads = min(cores, bands or cores)
         if bands is not None and bands > 1:
-            self._threads = max(self._threads, 2)  # so that bands run concurrently on one core, too
+            self._threads = max(self._threads, 2)  # bands run concurrently even on one core
         self._cpu_threads: CpuThreads | None = None
         self._prepared = False
         self._stages: list[Step] = []
@@ -130,8 +130,8 @@ class Scheduler:
     def let_go(self) -> None:
         """Free the arrays of a closed scheduler at once; it cannot be used again.
 
-        Arrays and stages refer to each other and would wait for the garbage collector, which counts objects: these are
-        few, but hold many megabytes. Arrays that results refer to stay.
+        Arrays and stages refer to each other, so only the garbage collector would free them. It runs after a number of
+        new objects, and these are few although they hold many megabytes. Arrays that results refer to stay.
         """
         with exclusive(self.device):
             self.arrays.clear()
@@ -147,7 +147,7 @@ class Scheduler:
         self._seen.clear()
 
     def restart(self) -> None:
-        """Make every stage run again in the next frame, with its remembered state cleared."""
+        """Make every stage run again in the next frame, without the state that it keeps between frames."""
         self.forget()
         with wp.ScopedDevice(self.device), exclusive(self.device):
             for stage, _ in self._stages:
@@ -156,7 +156,10 @@ class Scheduler:
                     self.arrays.touch(name)
 
     def continue_from(self, other: Scheduler) -> None:
-        """Copy the state that stages keep between frames from another plan's stages of equal name and shapes."""
+        """Copy the state that stages keep between frames from another scheduler's stages.
+
+        A stage is continued if the other scheduler has a stage of its name with arrays of equal shapes.
+        """
         others = {stage.name: stage for stage, _ in other._stages}
         for stage, _ in self._stages:
             if stage.name not in others or others[stage.name] is stage:
@@ -169,11 +172,14 @@ class Scheduler:
                 stage.resume(others[stage.name])
 
     def constants(self) -> dict[Any, Any]:
-        """Return the arrays of constants, such as tables, for a next pipeline to share; none before ``prepare``."""
+        """Return the arrays of constants, such as tables, for the next pipeline to share; empty before ``prepare``."""
         return self.arrays.constants if self._prepared else {}
 
     def spare(self) -> dict[str, Any]:
-        """Return arrays that neither a result nor the next pipeline needs; none on CUDA, which has a memory pool."""
+        """Return arrays, by name, that neither a result nor the next pipeline needs, so that they can be overwritten.
+
+        The result is empty on CUDA, where a memory pool makes reuse unnecessary.
+        """
         if not self._on_cpu:
             return {}
         needed = {*self.plan.request.resources, *LIGHT_ARRAYS}
@@ -188,8 +194,8 @@ class Scheduler:
         """Compile and load every kernel in parallel, and compute the stages' tables; a second call does nothing.
 
         Args:
-            progress: Receives the numbers of compiled modules and of all modules to compile, first 0; not called if
-                none is.
+            progress: Function to which the numbers of compiled modules, first 0, and of all modules to compile are
+                passed; not called if there are none to compile.
         """
         if self._prepared:
             return
@@ -202,11 +208,11 @@ class Scheduler:
                     if not step.on_host:
                         with noting() as noted:
                             step.launch(None if step.rows is None else (0, step.rows))
-                        if noted:  # else it did its work without a launch, as it will in each frame
+                        if noted:  # a pass without a recorded launch is run by Python in each frame
                             notes[id(step)] = noted
         found = [*(note for each in notes.values() for note in each), *self._first_launches]
         launched = [(note.kernel, note.block_dim) for note in found if note.kernel is not None]
-        # A launch loads its module with the module's own block size; other block sizes on CUDA must be named.
+        # Modules are loaded for their own block size; other block sizes on CUDA must be listed.
         blocks = [one for one in launched if not self._on_cpu and one[1] != one[0].module.options["block_dim"]]
         kernels = [one[0] for one in launched if one not in blocks]
         own = [serve_kernel] if self._threads > 1 and self._on_cpu else []
@@ -223,13 +229,14 @@ class Scheduler:
         self._prepared = True
 
     def warm_up(self, progress: Progress | None = None) -> None:
-        """Compile and load every kernel; on CUDA launch everything once, on the arrays' current values.
+        """Compile and load every kernel; on CUDA also launch every pass once, on the arrays' current values.
 
-        Steps on the host are left out. On CUDA it runs on a separate stream, and other pipelines' frames run between
-        its steps.
+        Passes on the host are not run. The launches are on a separate stream, and frames of other pipelines can run
+        between them.
 
         Args:
-            progress: Receives the numbers of compiled modules and of all modules to compile.
+            progress: Function to which the numbers of compiled modules, first 0, and of all modules to compile are
+                passed.
         """
         self.prepare(progress)
         self._frame_culling.forget()
@@ -250,10 +257,10 @@ class Scheduler:
             wp.synchronize_stream(stream)
 
     def run(self, receive: Callable[[], None] | None = None) -> Mapping[str, StageTiming]:
-        """Run the stages that this frame needs and whose inputs have changed; return the time of each.
+        """Run the stages that this frame needs and whose inputs have changed; return the time of every stage by name.
 
         Args:
-            receive: Called when the stages to run are known, before anything is launched.
+            receive: Function that is called when the stages to run are known, before anything is launched.
         """
         self.prepare()
         try:
@@ -265,11 +272,11 @@ class Scheduler:
             elif not self._on_cpu:
                 times = self._run_captured(due)
             elif self._cpu_threads is None or sys.gettrace() is not None:
-                times = self._run_eager(due)  # under a debugger, so that it stops at breakpoints in launchers
+                times = self._run_eager(due)  # a debugger (a trace function) then stops at breakpoints in launchers
             else:
                 times = self._run_side_by_side(due)
         except BaseException:
-            self.forget()  # part of the work may not have been done
+            self.forget()  # some of the stages may not have run
             raise
         return timings | {name: StageTiming(milliseconds, False) for name, milliseconds in times.items()}
 
@@ -325,7 +332,7 @@ class Scheduler:
         self._translated.add(id(step))
 
     def _run_captured(self, due: list[Step]) -> dict[str, float]:
-        """Replay the CUDA graphs of these passes, after capturing those that are new; return milliseconds by stage."""
+        """Replay the CUDA graphs of these passes, first capturing new ones; return milliseconds by stage."""
         key = tuple(id(step) for _, steps in due for step in steps)
         if key not in self._patterns:
             self._patterns[key] = _segments(due)
@@ -353,7 +360,7 @@ class Scheduler:
             wp.capture_launch(graph, stream=self._stream)
             return
         with exclusive(self.device), wp.ScopedStream(self._stream, sync_enter=False):
-            # The first launch is outside a capture: it loads every module, which a capture must not do.
+            # The first launch is not captured, because it may load modules, which is not allowed in a capture.
             self._launch_in_turn(segment.part)
             with capturing(), wp.ScopedCapture(device=self.device) as capture:
                 if self._marks is None:
@@ -363,7 +370,7 @@ class Scheduler:
         self._graphs[segment.key] = capture.graph
 
     def _launch_in_turn(self, part: list[Step]) -> None:
-        """Launch stages one after another; when profiling, each between two events."""
+        """Launch stages one after another; if the pipeline profiles, each between two events."""
         for _stage, steps in part:
             if self._marks is not None:
                 begin, end = self._marks.setdefault(_ids(steps), _make_marks(self.device))
@@ -374,7 +381,7 @@ class Scheduler:
                 wp.record_event(end)
 
     def _launch_side_by_side(self, part: list[Step]) -> None:
-        """Launch each stage on its own stream; its passes wait for the writers of their inputs."""
+        """Launch each stage on a stream of its own; a pass waits for the stages that write its inputs."""
         stream = self._stream
         begun = stream.record_event()
         written: dict[str, Any] = {}
@@ -400,7 +407,9 @@ class Segment:
     """Stages of a frame that run on the host, or that are captured together as one graph."""
 
     on_host: bool
+    """True if the passes run on the host."""
     part: list[Step]
+    """Stages with their passes in this segment."""
     key: tuple[int, ...]
     """Ids of its passes."""
 
@@ -414,7 +423,7 @@ def _ids(steps: list[Pass]) -> tuple[int, ...]:
 
 
 def _in_launch_order(part: list[Step]) -> list[Step]:
-    """Return the stages in launch order: after the stages that they run after, but before their own readers."""
+    """Return the stages in launch order: each after those named by its ``runs_after``, but before its own readers."""
     ordered = list(part)
     for step in part:
         stage = step[0]
@@ -430,7 +439,7 @@ def _in_launch_order(part: list[Step]) -> list[Step]:
 
 
 def _segments(due: list[Step]) -> list[Segment]:
-    """Return the stages in order, cut into segments that are captured together and segments on the host."""
+    """Return the stages in order, divided into segments that are captured as graphs and segments on the host."""
     steps = [(step.on_host, stage, step) for stage, passes in due for step in passes]
     steps.sort(key=lambda one: not one[2].beforehand)
     parts = [

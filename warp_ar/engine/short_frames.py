@@ -1,8 +1,9 @@
-"""Frames of exposures other than the shown one: they only contribute to the environment.
+"""Frames of exposures other than the shown one, which only contribute to the environment.
 
-If a source alternates between exposures, showing all frames would flicker. The reference is the longest exposure or the
-chosen one: only its frames are lit and shown, and all radiance is in its camera values. The ball is unwrapped from the
-other frames, and the stage ``bracket`` merges the maps.
+If a source alternates between exposures, showing all frames would flicker. The reference is the longest exposure, or
+the one that the caller chose. Only its frames are lit and shown, and all radiance is in units of its pixel values. From
+the other frames, only the mirror ball is unwrapped to an environment map. The stage ``bracket`` merges the maps of all
+exposures.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from warp_ar.stages.shared.probe_maps import UNWRAPPED
 from warp_ar.stages.unwrap import Unwrap
 
 KEPT_SECONDS = 3.0
-"""Seconds for which a frame of another exposure is used: the light may change afterwards."""
+"""Seconds for which the map of a frame of another exposure is used; it may be outdated afterwards."""
 
 
 class ShortFrames:
-    """Unwraps frames of every exposure except the reference."""
+    """Environment maps from the latest frames of every exposure except the reference."""
 
     def __init__(self, features: Features, arrays: Arrays, device: Any) -> None:
         """Allocate arrays, and build the passes of ``unwrap``.
@@ -67,15 +68,15 @@ class ShortFrames:
         now: float,
         linear: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None,
     ) -> None:
-        """Unwrap one frame.
+        """Unwrap the mirror ball of one frame.
 
         Args:
-            image: Frame, in a form that a pipeline takes.
-            index: Index of its exposure.
+            image: Frame, uint8 RGB (height, width, 3) or a Warp array (height, width) of ``wp.vec3ub``.
+            index: Index of its exposure in the bracket.
             pose: ``camera_from_world``.
-            params: Frame constants of the pipeline; only the pose is replaced.
+            params: Frame constants of the pipeline, in a copy of which the pose is replaced.
             now: Time of the frame, seconds.
-            linear: Its linear radiance and the radiance that clips, if it has more than 8 bits.
+            linear: Linear radiance of a frame with more than 8 bits, and its ``clip_levels``; else None.
         """
         values = params.copy()
         inverse = pose.inverse()
@@ -99,8 +100,8 @@ class ShortFrames:
         """Mark the exposures that are recent enough to merge with the reference frame of time ``now``.
 
         Returns:
-            True if more exposures are merged than before. The environment accumulated so far was clipped without the
-            new exposure, and the running mean must not start from it.
+            True if more exposures are merged than before. The environment accumulated so far lacks the light that only
+            the new exposure shows, so the running mean must start again.
         """
         recent = [abs(now - taken) < KEPT_SECONDS for taken in self._taken]
         told = tuple(index == self._reference or new for index, new in enumerate(recent))
@@ -115,6 +116,9 @@ class ShortFrames:
         return self._merged > before
 
     def resume(self, other: ShortFrames) -> None:
-        """Take over the times of another pipeline's frames if its exposures are equal; its arrays are copied before."""
+        """Take over the times of another pipeline's frames, if its exposures are equal.
+
+        The maps themselves are copied before, by ``Scheduler.continue_from``.
+        """
         if self._ratios == other._ratios:
             self._taken, self._merged = list(other._taken), other._merged

@@ -1,8 +1,9 @@
-"""Change from one pipeline to another while frames run: the new one is built on a thread and swapped in between frames.
+"""Change from one pipeline to another between frames, while the new one is built on another thread.
 
-The caller requests a target (``want``) and, before each frame, switches to it if its pipeline is ready (``take``). If
-the target differs from the running pipeline in numbers only, they are written into that pipeline. Any other target is
-built on a separate thread. A new pipeline takes over the light, the clock and the marker's track.
+The caller requests a target, the description of a pipeline (``want``). Before each frame it switches to the target if
+its pipeline is ready (``take``). If the target differs from the running pipeline in numbers only, they are written into
+that pipeline. Any other target is built on a separate thread. A new pipeline takes over the light, the clock and the
+marker's track.
 """
 
 from __future__ import annotations
@@ -21,9 +22,8 @@ from warp_ar.sources.exposures import plan_bracket
 from warp_ar.stages.quality import Quality
 
 Prepare: TypeAlias = Callable[[Pipeline], Any]
-"""Function that prepares a new pipeline on the builder's thread, before it lights a frame; its result is passed to
-``Admit``.
-"""
+"""Function that prepares a new pipeline on the builder's thread, before the pipeline lights a frame. Its result is
+passed to ``Admit``."""
 
 Admit: TypeAlias = Callable[[Pipeline, Any], bool]
 """Function that decides, on the thread that lights frames, whether a newly built pipeline may light them."""
@@ -34,10 +34,13 @@ class Target:
     """Description of a pipeline to build. Targets are compared by identity: make a new one only for a change."""
 
     scene: Scene
+    """Scene to show."""
     quality: Quality
+    """Quality of the pipeline."""
     size: tuple[int, int] | None = None
     """Width and height of the frames; None means the scene's."""
     outputs: tuple[str, ...] = ("image",)
+    """Outputs of the pipeline."""
     exposures: tuple[float, ...] = ()
     """Exposure times in seconds between which the frames alternate."""
     shown: float | None = None
@@ -56,9 +59,9 @@ class PipelineSwitcher:
         """Start without a pipeline.
 
         Args:
-            builder: Thread pool that builds; None makes one that ends with the switcher.
-            keep: Number of former pipelines that are kept, to return to them without building.
-            **arguments: Arguments of every ``Pipeline``: ``device``, ``bands``, ``estimates``.
+            builder: Thread pool on which pipelines are built; None makes one that ends with the switcher.
+            keep: Largest number of former pipelines that are kept, to return to them without building.
+            **arguments: Arguments of every ``Pipeline``, such as ``device``, ``bands`` and ``estimates``.
 
         Raises:
             UsageError: ``keep`` is below 0, or an argument has another type.
@@ -77,7 +80,7 @@ class PipelineSwitcher:
         self._building: Future[tuple[Pipeline, Any]] | None = None
         self._built_for: Target | None = None
         self.pipeline: Pipeline | None = None
-        """Pipeline that lights the next frame; None before the first ``take`` of a built pipeline."""
+        """Pipeline that lights the next frame; None until the first one is built and taken."""
         self.swaps = 0
         """Number of switches to another pipeline, the first included."""
 
@@ -108,8 +111,8 @@ class PipelineSwitcher:
         """Switch to the requested target if its pipeline is ready.
 
         Args:
-            admit: Called for a newly built pipeline; if it returns False, the previous target becomes the requested one
-                again.
+            admit: Function that is called for a newly built pipeline. If it returns False, the pipeline is discarded,
+                and the previous target is requested again.
 
         Returns:
             The pipeline for the next frame; None before the first one is built.
@@ -121,11 +124,11 @@ class PipelineSwitcher:
             building, self._building = self._building, None
             try:
                 built = building.result()
-            except Exception:  # not only WarpArError: otherwise the pipeline would be built again before each frame
+            except Exception:  # after any error, the target is refused; else it would be built again for each frame
                 if self._built_for is self._wanted:
                     self._refused, self._wanted = self._wanted, self._shown
                     raise
-                # Another target is requested by now; this failure does not concern it.
+                # If another target is requested by now, the failure does not concern it.
             else:
                 self._take_built(*built, admit)
         if self._wanted is not self._shown and self._building is None:
@@ -147,11 +150,11 @@ class PipelineSwitcher:
             self._go_over(pipeline)
 
     def shows(self, target: Target) -> bool:
-        """Return True if the next frame is lit as the target describes."""
+        """Return True if the next frame is lit by the pipeline of this target."""
         return self._shown is target
 
     def follow(self, target: Target, *, prepare: Prepare = Pipeline.warm_up) -> Pipeline | None:
-        """Call ``want`` and ``take``.
+        """Request a target and switch to it if its pipeline is ready: ``want``, then ``take``.
 
         Args:
             target: Description of the pipeline for the next frames.
@@ -180,7 +183,7 @@ class PipelineSwitcher:
     def _ready(self) -> Pipeline | None:
         """Return a running or kept pipeline that fits the requested target; None if there is none."""
         assert self._wanted is not None
-        # Latest first.
+        # The latest pipeline comes first.
         known = [pipeline for pipeline in (self.pipeline, *reversed(self._kept)) if pipeline is not None]
         return next((pipeline for pipeline in known if _fits(pipeline, self._wanted)), None)
 
@@ -208,12 +211,12 @@ class PipelineSwitcher:
                 pipeline.close()
             if isinstance(error, WarpArError):
                 raise
-            raise cannot_run(target.quality, error) from error  # the running pipeline goes on
+            raise cannot_run(target.quality, error) from error  # the running pipeline stays in use
 
     def _go_over(self, pipeline: Pipeline) -> None:
         before = self.pipeline
         if before is not None and pipeline is not before:
-            pipeline.continue_from(before)  # first: an error of a failed frame keeps the previous pipeline
+            pipeline.continue_from(before)  # comes first: if it raises a frame's error, the previous pipeline stays
         self._shown = self._wanted
         if pipeline is before:
             return
@@ -235,7 +238,7 @@ class PipelineSwitcher:
         """Close every pipeline. The switcher can be used again, unless the builder was its own.
 
         Args:
-            wait: Whether to wait for a build in progress; otherwise its pipeline is closed when it is done.
+            wait: True to wait for a build in progress; otherwise its pipeline is closed when it is built.
         """
         building, self._building = self._building, None
         if building is not None:
@@ -255,7 +258,7 @@ class PipelineSwitcher:
 
 
 def _fits(pipeline: Pipeline, target: Target) -> bool:
-    """Return True if a pipeline fits a target; numbers that differ are first written into the pipeline."""
+    """Return True if a pipeline fits a target; numbers of the scene that differ are written into the pipeline."""
     request = pipeline.plan.request
     camera = target.scene.camera
     size = (camera.width, camera.height) if target.size is None else target.size

@@ -1,11 +1,14 @@
 """Asynchronous transfers of frames to a CUDA device and of pictures back, by pinned memory and two streams.
 
-A frame passes through pinned host memory, a transfer to the device, the kernels, and a transfer back to pinned memory.
-Each of ``SLOTS`` slots has buffers for the first two steps and the last, so that the host fills one slot while the copy
-engines transfer a second and the kernels work on a third. Kernels use arrays of their own, whose addresses a captured
-graph may keep; the copies between these and the slots on the device take a hundredth of the time of the bus. A picture
-stays in its pinned memory until nothing refers to it: another copy would take the host longer than all other steps.
-Frames need no copy either if the source writes them into the memory of ``new_frame``, as a ``Session`` does.
+A frame is written to pinned host memory, transferred to the device and processed by the kernels; the picture is then
+transferred back to pinned memory. Each of ``SLOTS`` slots has buffers for one frame, so that the host fills one slot
+while the copy engines transfer a second and the kernels work on a third. Kernels use separate arrays, because a
+captured graph needs fixed addresses. The copies between these arrays and the slots, on the device, take a hundredth of
+the time of the transfers.
+
+A picture stays in its pinned memory until nothing refers to it, because another copy would take the host longer than
+all other steps. A frame is not copied on the host either, if the source writes it into the memory of ``new_frame``, as
+a ``Session`` does.
 """
 
 from __future__ import annotations
@@ -24,21 +27,24 @@ from warp_ar.device import exclusive, wait_for
 Image = npt.NDArray[np.uint8]
 
 SLOTS = 3
-"""Frames in progress at once; the host waits before it begins one more."""
+"""Largest number of frames in progress; the host waits before it begins one more."""
 
 KEPT = 8
-"""Pictures in pinned memory at once; further ones use ordinary memory, for which the host waits."""
+"""Largest number of pictures in pinned memory; further ones use ordinary memory, for which the host waits."""
 
 FRAME_BYTES = 1 << 29
 """Largest total size in bytes of pinned frames by ``new_frame``; further frames use ordinary memory, which is copied
 before the transfer."""
 
 MARKED = 16
-"""Number of frames whose times on the device are kept."""
+"""Number of latest frames whose times on the device are kept."""
 
 
 class Marks:
-    """CUDA events of one frame's steps; streams wait for the same events that measure the times."""
+    """CUDA events of one frame's steps, for which streams wait and which measure the times.
+
+    ``frame`` is the number of the frame; -1 before the first.
+    """
 
     def __init__(self, device: Any) -> None:
         self.frame = -1
@@ -55,14 +61,14 @@ class Slot:
         self.own = Pinned(shape)
         """Pinned memory for a frame whose own memory is not pinned."""
         self.source = self.own
-        """Array from which the frame is sent."""
+        """Pinned memory from which the frame is sent."""
         self.given: Image | None = None
-        """Caller's picture, while it is sent from its own memory."""
+        """Caller's picture, if it is sent from its own memory."""
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.image = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.consumed = wp.Event(device)
         self.downloaded: Any = None
-        """Event after the last download from this slot or a later one."""
+        """Event after the last download from this slot, or after a later download into the same buffer."""
 
     @property
     def host(self) -> Image:
@@ -93,7 +99,7 @@ class Buffer(Pinned):
 
 
 class _Holder:
-    """Owner of memory that several arrays refer to; it is collected with the last of them."""
+    """Owner of memory to which several arrays refer; it is freed with the last of them."""
 
     def __init__(self, host: Image) -> None:
         self.__array_interface__ = host.__array_interface__
@@ -104,7 +110,7 @@ def _address(image: Image) -> int:
 
 
 class Transfers:
-    """Moves frames of one size to and from one CUDA device."""
+    """Transfers of frames of one size to and from one CUDA device."""
 
     def __init__(self, shape: tuple[int, int], device: Any) -> None:
         """Allocate the slots.
@@ -118,14 +124,14 @@ class Transfers:
         self._up, self._down = wp.Stream(device), wp.Stream(device)
         self._slots = [Slot(shape, device) for _ in range(SLOTS)]
         for stream in (self._up, self._down):
-            stream.wait_stream(self._compute)  # the compute stream clears the slots, which must precede the first frame
+            stream.wait_stream(self._compute)  # the compute stream clears the slots; the first frame must come later
         self._uploads = self._downloads = 0
         self._marks = [Marks(device) for _ in range(MARKED)]
         self._marking = self._marks[0]
         self._free = collections.deque(Buffer(shape, device, pinned=True) for _ in range(SLOTS))
         self._buffers = SLOTS
         self._frames: dict[int, Pinned] = {}
-        """Memory from ``new_frame``, by its address."""
+        """Pinned memory for frames from ``new_frame``, by its address."""
         self._free_frames: collections.deque[Pinned] = collections.deque()
 
     def close(self) -> None:
@@ -135,7 +141,7 @@ class Transfers:
                 wait_for(slot.downloaded)
 
     def new_frame(self) -> Image:
-        """Return memory for a frame that is sent without a copy; it must not be changed after it has been submitted.
+        """Return an array for a frame that is sent without a copy; it must not be changed after it has been submitted.
 
         Returns:
             uint8 (height, width, 3), of any values. The memory is reused when nothing refers to it any more.
@@ -151,9 +157,10 @@ class Transfers:
         return memory.lend(self._free_frames)
 
     def upload(self, image: Image) -> Slot:
-        """Start the transfer of a host picture; the caller may overwrite the picture when this returns.
+        """Start the transfer of a host picture to the device.
 
-        A picture in memory of ``new_frame`` is sent from there, and is referenced until it has been sent.
+        A picture in an array of ``new_frame`` is sent from there; it must not be changed. Any other picture is copied
+        first, so that the caller may overwrite it.
 
         Returns:
             Slot to pass to ``receive``, before ``SLOTS`` more pictures are sent.
@@ -175,7 +182,7 @@ class Transfers:
         return slot
 
     def receive(self, slot: Slot, frame_out: Any) -> None:
-        """Copy an uploaded picture into ``frame_out`` on the kernels' stream, before later kernels."""
+        """Copy an uploaded picture into ``frame_out`` on the stream of the kernels, which read it afterwards."""
         self._compute.wait_event(slot.marks.arrived)
         self._compute.record_event(slot.marks.started)
         self._marking = slot.marks
@@ -196,8 +203,7 @@ class Transfers:
             buffer = Buffer(self._shape, self._device, pinned=False)
             kept: Image = buffer.host
         else:
-            # The next picture is sent to this memory on the same stream, so after this one even if nothing waited for
-            # it.
+            # The next picture for this memory is sent on the same stream, so it cannot arrive before this one.
             kept = buffer.lend(self._free)
         with exclusive(self._device):  # other pipelines may be capturing on the same stream
             if slot.downloaded is not None:
@@ -215,7 +221,7 @@ class Picture:
     """Picture in transfer to the host."""
 
     def __init__(self, image: Image, buffer: Buffer, marks: Marks) -> None:
-        """Take the host array, which is complete when ``buffer`` is done, and the ``marks`` of its frame."""
+        """Store the host array, which is complete after the event ``buffer.done``, and the events of its frame."""
         self._image, self._rendered, self._done = image, buffer.rendered, buffer.done
         self._marks, self._frame = marks, marks.frame
 
@@ -225,7 +231,10 @@ class Picture:
         return self._image
 
     def steps(self) -> dict[str, float]:
-        """Return milliseconds of its steps on the device; empty if ``MARKED`` later frames have reused the events."""
+        """Return milliseconds of the frame's steps on the device, by name.
+
+        The result is empty if ``MARKED`` later frames have reused the events.
+        """
         wait_for(self._done)
         marks = self._marks
         if marks.frame != self._frame:

@@ -62,7 +62,9 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def command(options: argparse.Namespace) -> int:
-    """Run a subcommand; if a run cannot be begun, no folder is left.
+    """Run a subcommand and return the exit code.
+
+    The job file and the workers are checked before the run's folder is made.
 
     Raises:
         RunError: The run is damaged, or cannot go on.
@@ -85,7 +87,12 @@ def command(options: argparse.Namespace) -> int:
 
 
 def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], Pool]) -> int:
-    """Do the remaining jobs of a run.
+    """Do the remaining jobs of a run and return the exit code.
+
+    Args:
+        options: Options of the command.
+        folder: Folder of the run.
+        employ: Function that starts the workers of a run.
 
     Raises:
         RunError: The run is damaged, or cannot go on.
@@ -110,12 +117,16 @@ def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], 
             failed = Driver(jobs, folder, manifest, pool, say).run()
         finally:
             manifest.close()
-            clear_aside(folder)  # killed workers leave temporary files, which take up space
+            clear_aside(folder)  # workers that were killed have left temporary files
     return _tell(folder, failed)
 
 
 def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
-    """Return a function that makes the workers of a run; check here that they can be made."""
+    """Return a function that starts the workers of a run.
+
+    Raises:
+        UsageError: The workers cannot be started.
+    """
     if options.ray is None:
         devices = devices_of(options.device, options.workers)
         return lambda context: ProcessPool(context, devices)
@@ -123,7 +134,12 @@ def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
 
 
 def _tell(folder: Path, failed: dict[str, str]) -> int:
-    """Print the outcome of a run; return the exit code."""
+    """Print the outcome of a run and return the exit code.
+
+    Args:
+        folder: Folder of the run.
+        failed: Reasons of failed jobs, by their keys.
+    """
     status = read_status(folder)
     counts = words_of_counts(status["done"])
     print(printable(f"{folder}: {counts or 'nothing'} done, {status['frames']} frames, {status['bytes'] / 1e6:.1f} MB"))
@@ -136,7 +152,7 @@ def _tell(folder: Path, failed: dict[str, str]) -> int:
 
 
 def plan(options: argparse.Namespace) -> int:
-    """Count jobs, try a few, and print the expected time and size of the run."""
+    """Count jobs, try a few, and print the expected time and size of the run; return the exit code."""
     with importing():
         from warp_ar.farm.plan import tell_plan
 

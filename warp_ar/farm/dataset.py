@@ -1,9 +1,11 @@
 """Table ``[dataset]`` of a job file, and the random scene of each variation.
 
-Objects and lights are described as in scene files; a number to be drawn is given as a span, ``[lowest, highest]``. The
-random numbers of a variation depend only on (seed, index of the clip, index of the variation), not on the worker or on
-the time. Objects stand on the receiver without touching each other, the modelled desk, the mirror balls or the marker's
-card, and occlude the marker in no frame of the clip.
+A variation is a copy of a clip with randomly drawn virtual objects and lights. Objects and lights are described as in
+scene files. A number to be drawn is given as a span, ``[lowest, highest]``. The random numbers of a variation depend
+only on (seed, index of the clip, index of the variation), not on the worker or on the time.
+
+Objects stand on the receiver, the physical surface under them. They do not touch each other, other modelled surfaces,
+the mirror balls or the marker's card. They do not occlude the marker in any of ``CAMERAS`` camera poses of the clip.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ class JobTable(Table):
     error = JobsError
 
     def path(self, key: str) -> Path | None:
-        """Return a file or folder, relative to the job file; it need not exist."""
+        """Return the absolute path of a file or folder that is given relative to the job file; it need not exist."""
         if key not in self.data:
             return None
         value = self.text(key)
@@ -81,7 +83,7 @@ def _is_span(value: object) -> bool:
 
 _KEYS = ("variations", "seed", "objects", "lights", "every", "region", "margin", "exposure", "object", "light")
 _OWN_KEYS = ("name", "turn", "rest", "weight")
-"""Keys of an object or a light in addition to those of a scene."""
+"""Keys of an object that objects of a scene do not have."""
 _OBJECT_KEYS = ("shape", "file", "radius", "size", "major_radius", "minor_radius", "scale", "rotate", "material")
 _LIGHT_KEYS = ("kind", "weight", "intensity", "color", *Light.USES["spot"])
 _LIGHT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
@@ -89,11 +91,12 @@ _LIGHT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "spot": {"intensity": 1.0, "target": [0.0, 0.0, 0.0], "inner_angle": 15.0, "outer_angle": 8.0},
 }
 RESTS = ("upright", "any")
-"""Orientations of objects: rotated about the vertical only, or in any way; the lowest point touches the desk."""
+"""Orientations of objects: rotated about the vertical only, or in any way; the lowest point touches the receiver."""
 MOST = 64
 """Largest number of objects, and of lights, in a picture."""
 Share = Callable[[tuple[int, ...]], Any]
-"""Function from an array's shape to an array of random numbers from 0 (lowest) to 1 (highest)."""
+"""Function that returns an array of numbers of a given shape; 0 stands for the lowest value of a span, 1 for the
+highest."""
 
 
 def draw(value: Any, share: Share) -> Any:
@@ -108,20 +111,28 @@ def draw(value: Any, share: Share) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """Kind of object or light: its table, which may contain spans."""
+    """Kind of object or light, as a table that may contain spans."""
 
     label: str
+    """Name of the job file in messages."""
     folder: Path
+    """Folder to which paths in the table are relative."""
     section: str
     """Name of the table."""
     data: Mapping[str, Any]
+    """Content of the table."""
     weight: float
-    """Relative weight with which it is chosen."""
+    """Relative weight with which the kind is chosen."""
 
     def table(self, share: Share, kind: type) -> SceneTable:
-        """Return a draw of the table as a table of a scene."""
+        """Return the table with drawn values, in the form of a scene's table.
+
+        Args:
+            share: Source of random numbers.
+            kind: Class whose fields are the allowed keys.
+        """
         data = draw(dict(self.data), share)
-        if "outer_angle" in data:  # drawn beyond the inner angle
+        if "outer_angle" in data:  # the table gives the angle between inner and outer cone
             data["outer_angle"] = round(data["outer_angle"] + data.get("inner_angle", 0.0), 6)
         return SceneTable(self.label, SceneFiles(self.folder), self.section, data, list(fields_of(kind)))
 
@@ -136,21 +147,22 @@ class Entry:
 
 @dataclasses.dataclass(frozen=True)
 class ObjectSpec(Entry):
-    """Kind of object; its index in the catalogue, from 1 on, is its label."""
+    """Kind of object; its index in the catalogue, counted from 1, is its label."""
 
     name: str
+    """Name of the category."""
     turn: tuple[float, float]
     """Lowest and highest rotation about the vertical, degrees."""
     rest: str
     """One of ``RESTS``."""
 
     def draw(self, share: Share) -> Object:
-        """Draw one object, in the orientation of ``rotate`` before its random rotation."""
+        """Draw one object, in the orientation of the key ``rotate``, without the random rotation."""
         return read_object(self.table(share, Object))
 
     @functools.cached_property
     def item(self) -> Object:
-        """Object of this kind; all draws share its shape, size and scale."""
+        """Object of this kind for questions of shape, size and scale, which are the same in all draws."""
         return self.draw(np.zeros)
 
 
@@ -161,6 +173,7 @@ class Dataset:
     variations: int
     """Number of variations of each clip."""
     seed: int
+    """Seed of the random numbers."""
     objects: tuple[int, int]
     """Least and largest number of objects in a picture."""
     lights: tuple[int, int]
@@ -170,15 +183,22 @@ class Dataset:
     region: tuple[float, ...] | None
     """Area for objects as x0, y0, x1, y1 in metres; None: the receiver within 0.25 m of the marker."""
     margin: float
-    """Least distance in metres between objects, and between objects and the modelled desk."""
+    """Least horizontal distance in metres of an object from other objects, modelled surfaces, balls and the card."""
     exposure: tuple[float, float]
-    """Lowest and highest scale of the exposure."""
+    """Lowest and highest factor of the simulated exposure (``Exposure.scale``)."""
     catalogue: tuple[ObjectSpec, ...]
+    """Kinds of objects."""
     kinds_of_light: tuple[Entry, ...]
+    """Kinds of virtual lights."""
 
 
 def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     """Return the table ``[dataset]`` of a job file.
+
+    Args:
+        label: Name of the job file in messages.
+        folder: Folder of the job file.
+        data: Content of the table.
 
     Raises:
         JobsError: A key is wrong or missing, or an object or a light is not valid in a scene.
@@ -224,7 +244,7 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
 
 
 def _entries(table: JobTable, key: str, keys: Sequence[str]) -> list[JobTable]:
-    """Return the tables of an array of tables."""
+    """Return the tables ``[[dataset.KEY]]`` with ``key`` for KEY; ``keys`` are the keys that they may have."""
     found = table.data.get(key, [])
     if not isinstance(found, list):
         table.fail(key, f"expected [[dataset.{key}]]")
@@ -257,7 +277,7 @@ def _read_light(table: JobTable) -> Entry:
 
 
 def _entry(table: JobTable, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of ``Entry``."""
+    """Return the arguments of ``Entry`` for a table with the given content."""
     weight = table.number("weight", 1.0, low=0.0, high=1e6)
     return {"label": table.label, "folder": table.folder, "section": table.section, "data": data, "weight": weight}
 
@@ -267,20 +287,21 @@ Points = npt.NDArray[np.float64]
 TRIES = 200
 """Number of trial places for an object before it is left out."""
 CAMERAS = 24
-"""Number of poses of a clip, evenly spaced, in which the marker must be visible."""
+"""Largest number of evenly spaced camera poses of a clip for which the visibility of objects and marker is tested."""
 CARD = 1.4
-"""Side of the marker's card over that of the marker; objects do not stand on the card's margin."""
+"""Side of the marker's card, relative to the marker's side; objects do not stand on the card."""
 QUIET = 1.1
-"""Side over that of the marker of the area that must be visible, with white around the marker."""
+"""Side of the area that objects must not occlude, relative to the marker's side. It includes white around the
+marker."""
 REACH = 0.25
 """Distance from the marker in metres within which objects stand if the job file states no region."""
 
 CHUNK = 5000
-"""Variations that are sorted at once, in 0.2 s of the driver's time."""
+"""Number of variations that are sorted at once; this takes 0.2 s."""
 
 
 class NoPlace(Exception):
-    """Error if fewer objects than the least number could be placed."""
+    """Error of a variation in which fewer objects than the least number could be placed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,7 +329,7 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
     """Draw the scene of one variation.
 
     Args:
-        base: Scene of the clip with camera, marker and receiver; its own objects and lights are left out.
+        base: Scene of the clip with camera, marker and receiver; its objects and lights are replaced.
         dataset: Kinds of objects and lights to draw from.
         clip: Index of the clip.
         variation: Index of the variation.
@@ -319,7 +340,7 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
     """
     kinds, lights, exposure, random = _draw_kinds(dataset, clip, variation)
     drawn = [dataset.kinds_of_light[kind].draw(random.random) for kind in lights]
-    # In the catalogue's order, so that scenes with the same kinds share kernels and arrays.
+    # Objects are in the catalogue's order, so that scenes with equal kinds share kernels and arrays.
     placed = _place(base, dataset, sorted(kinds), poses, random)
     if len(placed) < dataset.objects[0]:
         raise NoPlace(
@@ -333,7 +354,7 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
 
 
 def _draw_kinds(dataset: Dataset, clip: int, variation: int) -> tuple[list[int], list[int], float, np.random.Generator]:
-    """Return a variation's object and light kinds, its exposure, and the generator for further draws."""
+    """Return indices of a variation's kinds of objects and of lights, its exposure, and a generator for more draws."""
     random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([dataset.seed, clip, variation])))
     count = int(random.integers(dataset.objects[0], dataset.objects[1] + 1))
     light_count = int(random.integers(dataset.lights[0], dataset.lights[1] + 1))
@@ -343,10 +364,10 @@ def _draw_kinds(dataset: Dataset, clip: int, variation: int) -> tuple[list[int],
 
 
 def in_kindred_order(dataset: Dataset, clip: int, count: int) -> Iterator[int]:
-    """Yield the indices of a clip's variations, those with the same kinds of objects and lights consecutively.
+    """Yield the indices of a clip's variations, ordered so that variations with equal kinds are consecutive.
 
-    These share a pipeline, which takes several times as long to build as a frame. ``CHUNK`` variations are sorted at a
-    time, so that a data set of any size begins at once.
+    Variations with equal kinds of objects and lights share a pipeline, which takes several times as long to build as a
+    frame takes to light. ``CHUNK`` variations are sorted at a time, so that a data set of any size begins at once.
 
     Args:
         dataset: Kinds of objects and lights to draw from.
@@ -372,7 +393,15 @@ def _choose(random: np.random.Generator, weights: Sequence[float], count: int) -
 def _place(
     base: Scene, dataset: Dataset, kinds: Sequence[int], poses: Sequence[Pose], random: np.random.Generator
 ) -> list[tuple[int, Object]]:
-    """Return objects of these kinds at free places; in random order, so that large kinds have no advantage."""
+    """Return objects at free places, each with the index of its kind; an object without a free place is left out.
+
+    Args:
+        base: Scene of the clip.
+        dataset: Kinds of objects.
+        kinds: Index in the catalogue of each object, in the order in which the objects are placed.
+        poses: Camera poses of the clip.
+        random: Generator of random numbers.
+    """
     receiver = receiver_of(base, dataset)
     seen = [poses[i] for i in np.linspace(0, len(poses) - 1, min(CAMERAS, len(poses))).astype(int)] if poses else []
     marker = [_project(base, pose, _marker_corners(base)) for pose in seen] if base.has_marker else []
@@ -398,7 +427,15 @@ def _place(
 def _try(
     drawn: Object, local: Points, spec: ObjectSpec, receiver: Receiver, random: np.random.Generator
 ) -> tuple[Object, Points]:
-    """Return an object at a random place of the region, resting on the receiver, and its points in the world."""
+    """Return an object at a random place of the region, resting on the receiver, and its points in the world.
+
+    Args:
+        drawn: The object, with its key ``rotate`` as orientation.
+        local: Its scaled points before rotation and translation, (n, 3) metres.
+        spec: Its kind.
+        receiver: The area for objects.
+        random: Generator of random numbers.
+    """
     x0, y0, x1, y1 = receiver.region
     x, y = x0 + random.random() * (x1 - x0), y0 + random.random() * (y1 - y0)
     rotation = rotation_matrix((0.0, 0.0, random.uniform(*spec.turn))) @ rotation_matrix(drawn.rotate)
@@ -413,12 +450,12 @@ def _try(
 
 
 def local_points(item: Object | Proxy) -> Points:
-    """Return points with the convex hull of an object before scale, rotation and translation, (n, 3) in metres."""
+    """Return an object's vertices before scale, rotation and translation, (n, 3) metres."""
     return np.asarray(mesh_of(item).vertices, np.float64)
 
 
 def receiver_of(scene: Scene, dataset: Dataset) -> Receiver:
-    """Return the area for objects: on the first modelled level plane, or on that of the marker."""
+    """Return the area for objects, on the scene's first horizontal plane, or without one on the marker's plane."""
     plane = next((p for p in scene.proxies if p.shape == "plane" and _is_level(p)), None)
     height = 0.0 if plane is None else plane.at[2]
     region = dataset.region
@@ -439,7 +476,7 @@ def _is_level(proxy: Proxy) -> bool:
 
 
 def _marker_corners(scene: Scene) -> Points:
-    """Return the corners of the marker or board including adjacent white, (4, 3)."""
+    """Return the corners of the marker or board with the white area around it that must be visible, (4, 3) metres."""
     board = scene.marker.board
     width, height = (scene.marker.size, scene.marker.size) if board is None else board.size
     corners = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
@@ -452,14 +489,17 @@ def _hull(points: Points) -> Points:
 
 
 def _inflated(outline: Points, margin: float) -> Points:
-    """Return an outline grown by at least ``margin``: its Minkowski sum with an octagon around that circle."""
+    """Return a convex outline grown by at least ``margin``.
+
+    The result is the Minkowski sum of the outline and an octagon around the circle of radius ``margin``.
+    """
     turn = np.arange(8) * (np.pi / 4)
     octagon = np.stack([np.cos(turn), np.sin(turn)], -1) * (margin / np.cos(np.pi / 8))
     return _hull((outline[:, None, :] + octagon).reshape(-1, 2))
 
 
 def _overlap(a: Points, b: Points) -> bool:
-    """Return True if two convex outlines overlap, that is, if no side of either separates them."""
+    """Return True if two convex outlines, (n, 2) each, overlap: no side of either outline separates them."""
     for outline, other in ((a, b), (b, a)):
         side = np.roll(outline, -1, 0) - outline
         normal = np.stack([side[:, 1], -side[:, 0]], -1)
@@ -488,7 +528,14 @@ def _is_in_view(scene: Scene, poses: Sequence[Pose], points: Points) -> bool:
 
 
 def _hides(scene: Scene, poses: Sequence[Pose], marker: Sequence[Points | None], points: Points) -> bool:
-    """Return True if the box around an object may occlude the marker in one of the poses."""
+    """Return True if the box around an object may occlude the marker in one of the poses.
+
+    Args:
+        scene: Scene with the camera.
+        poses: Camera poses.
+        marker: Corners of the marker in pixels for each pose, (4, 2); None if it is behind the camera.
+        points: Points of the object in the world, (n, 3).
+    """
     box = corners(np.stack([points.min(0), points.max(0)]))
     for pose, seen in zip(poses, marker, strict=False):
         pixels = _project(scene, pose, box)

@@ -1,6 +1,6 @@
 """Assignment of jobs to workers until all are done, with retries and final failures.
 
-The driver holds neither frames nor a list of jobs, only the number of jobs of each clip and which of them are open.
+The driver holds neither frames nor a list of jobs. It counts the open jobs of each clip, those neither done nor failed.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from warp_ar.farm.manifest import Manifest, RunError, bytes_of, changed_input, r
 from warp_ar.farm.pools import Pool
 
 TRIES = 2
-"""Number of failures after which a job has failed for good."""
+"""Number of failed attempts after which a job has failed for good."""
 LIGHTING = ("segment", "variation")
 """Kinds of jobs that light frames."""
 
 
 class Driver:
-    """Runs the jobs of a run by a pool of workers."""
+    """Driver of a run, which has its jobs done by a pool of workers."""
 
     def __init__(
         self,
@@ -35,28 +35,28 @@ class Driver:
         pool: Pool,
         say: Callable[[str], None],
     ) -> None:
-        """Find the open jobs.
+        """Prepare the run; jobs that are done already are found when their turn comes.
 
         Args:
             jobs: The job file.
             folder: Folder of the run.
             manifest: Manifest of the run, open for writing.
             pool: Workers.
-            say: Receives a line of progress from time to time.
+            say: Function to which lines about problems are passed.
         """
         self._jobs, self._folder, self._manifest, self._pool, self._say = jobs, folder, manifest, pool, say
         self._again: collections.deque[Job] = collections.deque()
         self._open: dict[int, int] = {}
-        """Number of jobs of a surveyed clip that are neither done nor failed."""
+        """Number of open jobs of each surveyed clip."""
         self._spent: set[int] = set()
-        """Clips with a job that has failed for good."""
+        """Clips with a job that has failed for good; they are not joined."""
         self._coming = self._list_jobs()
         self._surveyed: collections.deque[Iterator[Job]] = collections.deque()
         self._joins: collections.deque[Job] = collections.deque()
         self._finished_now = 0
 
     def _list_jobs(self) -> Iterator[Job]:
-        """Yield the surveys of all clips; open the jobs of clips that are surveyed already."""
+        """Yield the surveys that are still to be done; open the jobs of clips that are surveyed already."""
         for clip in range(len(self._jobs.clips)):
             survey = Job("survey", clip)
             if survey.key(self._jobs) in self._manifest.failed:
@@ -74,6 +74,9 @@ class Driver:
     def _refuse_changed(self, key: str) -> None:
         """Check that the files that a survey has read are unchanged.
 
+        Args:
+            key: Key of the survey.
+
         Raises:
             UsageError: A file has changed.
         """
@@ -83,7 +86,10 @@ class Driver:
             )
 
     def _is_done(self, job: Job) -> bool:
-        """Return True if a job's outputs are complete; correct the manifest if it disagrees."""
+        """Return True if a job's outputs are complete.
+
+        If the manifest says otherwise, it is corrected. Incomplete outputs are removed.
+        """
         key, place = job.key(self._jobs), self._folder / job.place(self._jobs)
         line = self._manifest.done.get(key)
         record = line if job.kind in ("join", "index") else record_at(place, key)
@@ -101,7 +107,7 @@ class Driver:
         return False
 
     def _open_clip(self, clip: int) -> None:
-        """Open the jobs of a surveyed clip."""
+        """Count a surveyed clip's jobs and add them to those to be done."""
         length = int(self._manifest.done[Job("survey", clip).key(self._jobs)]["length"])
         spec = self._jobs.clips[clip]
         if spec.end is not None and spec.end > length:
@@ -122,7 +128,7 @@ class Driver:
                 yield job
 
     def _settle(self, clip: int, *, failed: bool) -> None:
-        """Decrease a clip's number of open jobs; after the last one of a recording its segments can be joined."""
+        """Count one of a clip's jobs as done or failed; after the last segment of a recording, plan to join them."""
         self._open[clip] -= 1
         if failed:
             self._spent.add(clip)
@@ -132,7 +138,7 @@ class Driver:
                 self._joins.append(join)
 
     def _next_job(self) -> Job | None:
-        """Return the next job; None if no job can begin now."""
+        """Return the next job to submit; None if none can begin now."""
         while True:
             for waiting in (self._again, self._joins):
                 if waiting:
@@ -163,7 +169,7 @@ class Driver:
         return dict(self._manifest.failed)
 
     def _index(self) -> None:
-        """Write the common files of a data set, again if variations were added."""
+        """Have the common files of a data set written, unless they are complete and no variation was added."""
         done = [job for clip in sorted(self._open) for job in self._finished_jobs(clip)]
         if not done or (not self._finished_now and self._is_done(Job("index"))):
             return
@@ -182,7 +188,12 @@ class Driver:
                 yield job
 
     def _work(self, next_job: Callable[[], Job | None], arguments: Any = None) -> None:
-        """Submit jobs and take results until both are exhausted."""
+        """Submit jobs to idle workers and record their outcomes, until no job is left or running.
+
+        Args:
+            next_job: Function that returns the next job, or None if none can begin now.
+            arguments: Further data for the workers.
+        """
         running: dict[Future[Outcome], tuple[int, Job]] = {}
         idle = collections.deque(range(self._pool.size))
         while True:
@@ -198,7 +209,11 @@ class Driver:
                 idle.append(worker)
 
     def _take(self, job: Job, outcome: Outcome) -> None:
-        """Record the outcome of a job."""
+        """Record the outcome of a job, and plan the jobs that follow from it: a retry, or the jobs of a surveyed clip.
+
+        Raises:
+            RunError: The disk is full.
+        """
         key = job.key(self._jobs)
         if outcome.state == "full":
             raise RunError(

@@ -1,4 +1,4 @@
-"""Frames of a part of a recording, with their times in the whole recording."""
+"""Frames of a part of a recording, with their indices and times in the whole recording."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ DECODERS = 4
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrameIndex:
-    """Time stamps of the frames of a recording."""
+    """Index of a recording's frames: their time stamps."""
 
     ticks: npt.NDArray[np.int64]
-    """Time stamp of every frame, increasing, (n,)."""
+    """Time stamp of every frame in ticks, increasing, (n,)."""
     tick: fractions.Fraction
     """Duration of a tick in seconds."""
     seekable: bool
@@ -64,7 +64,7 @@ class VideoPart(VideoFile):
         self.length = end - first
 
     def _open(self, **how: Any) -> Any:
-        """Open as ``VideoFile`` does; if the GPU cannot decode it, the processor does, with the same pictures."""
+        """Open the file's container; if the GPU cannot decode it, the processor does, with equal pictures."""
         if self._gpu is not None:
             unit = HWAccel("cuda", device=str(self._gpu), allow_software_fallback=True)
             with contextlib.suppress(SourceError, NotImplementedError):
@@ -106,13 +106,16 @@ class VideoPart(VideoFile):
         yield from self._decode()
 
     def _time_of(self, number: int) -> float:
-        """Return the seconds of a frame since the first of the whole video; the formula is the same for every part."""
+        """Return the time in seconds of frame ``number`` since the first frame of the whole video.
+
+        It is computed from the index, so that it is equal in all parts that contain the frame.
+        """
         ticks = self._index.ticks
         return number / self.fps if self._retimed else float(int(ticks[number] - ticks[0]) * self._index.tick)
 
 
 class FolderPart(FrameFolder):
-    """Pictures ``first`` to ``end`` of a folder."""
+    """Pictures ``first`` to ``end`` of a folder, with the indices and times that they have in the whole folder."""
 
     def __init__(self, path: Path, first: int, end: int, fps: float) -> None:
         super().__init__(path, fps=fps)
@@ -131,7 +134,7 @@ class FolderPart(FrameFolder):
 
 
 def index_frames(path: Path, fps: float | None) -> FrameIndex:
-    """Return the times of a recording's frames; of a video only packets are read, without decoding.
+    """Return the times of a recording's frames; a video is not decoded, only its packets are read.
 
     Args:
         path: A video file or a folder of pictures.
@@ -164,7 +167,16 @@ def index_frames(path: Path, fps: float | None) -> FrameIndex:
 def open_part(
     path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
 ) -> RecordedSource:
-    """Return frames ``first`` to ``end`` of a recording; arguments as for ``VideoPart``."""
+    """Return frames ``first`` to ``end`` of a recording as a source.
+
+    Args:
+        path: A video file or a folder of pictures.
+        index: Index of the recording's frames.
+        first: Index of the first frame.
+        end: Index after the last frame.
+        fps: Show frame n at n / fps instead of its own time; None: at its own time.
+        gpu: Index of the GPU to decode with; None: the processor decodes.
+    """
     with open_source(path, fps=fps) as source:
         is_video = isinstance(source, VideoFile)
     if is_video:
@@ -173,13 +185,16 @@ def open_part(
 
 
 def mean_rate(ticks: npt.NDArray[np.int64], tick: fractions.Fraction) -> float:
-    """Return the mean frame rate of time stamps whose ticks last ``tick`` seconds."""
+    """Return the mean frame rate of time stamps in ticks, (n,), with ticks of ``tick`` seconds."""
     seconds = float(int(ticks[-1] - ticks[0]) * tick)
     return (len(ticks) - 1) / seconds if seconds > 0.0 else DEFAULT_FPS
 
 
 def shown_ticks(index: FrameIndex, fps: float | None) -> tuple[npt.NDArray[np.int64], fractions.Fraction]:
-    """Return time stamps for written frames, and the seconds of a tick: the recording's own unless ``fps`` is given."""
+    """Return the time stamps of written frames in ticks, (n,), and the duration of a tick in seconds.
+
+    They are the recording's own, or those of a constant rate ``fps`` if it is given.
+    """
     if fps is None:
         return index.ticks, index.tick
     rate = fractions.Fraction(fps).limit_denominator(1001)

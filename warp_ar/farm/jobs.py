@@ -1,7 +1,9 @@
-"""Job files, and their jobs: (clip, segment or variation, scene, seed).
+"""Job files, and their jobs.
 
-A job names files; frames stay in the worker that decodes them. Jobs are numbered, not listed: the jobs of a clip are
-known after its survey, and 100,000 of them take no memory before they are assigned.
+A clip is a recording to be lit. A job is a survey of a clip, a segment (consecutive frames of a clip) or a variation (a
+clip with randomly drawn objects and lights), or it joins finished outputs. A job names files; frames stay in the worker
+that decodes them. Jobs are not listed but computed from their numbers when they are assigned, so that 100,000 of them
+take no memory. Their number is known after the clip's survey.
 """
 
 from __future__ import annotations
@@ -25,13 +27,13 @@ from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
 SCHEMA = 1
 LIGHTS = ("follow", "fixed", "preroll")
-"""Light of a clip whose scene has a mirror ball: as captured for each frame, as captured at the clip's end, or as found
-by each segment from some frames before it on."""
+"""Light of a clip whose scene has a mirror ball. ``follow``: as captured in each frame. ``fixed``: as captured at the
+clip's end. ``preroll``: each segment captures it anew, beginning some frames before the segment."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 DECODERS = ("cpu", "gpu")
-"""Decoders of recordings: the processor, or the GPU's decoder if it has one for their codec."""
+"""Decoders of recordings: the processor, or the GPU if it can decode their codec."""
 AS_RECORDED = "recorded"
-"""Coding of written recordings besides ``CODINGS``: the bit depth of the source."""
+"""Value of the key ``coding`` besides ``CODINGS``: the output has the bit depth of the source."""
 _RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding", "digests")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
@@ -41,22 +43,26 @@ class Settings:
     """Settings of all clips."""
 
     quality: str = DEFAULT_PRESET
-    """A preset's name."""
+    """Name of a quality preset."""
     light: str = "follow"
     """One of ``LIGHTS``."""
     segment_frames: int | None = None
-    """Frames of a segment; None: one segment per clip."""
+    """Number of frames of a segment; None: one segment per clip."""
     preroll: int = 48
-    """Frames before a segment that determine its light and track, with ``light = "preroll"``."""
+    """Number of frames before a segment from which its light and tracking begin, with ``light = "preroll"``."""
     decode: str = DECODERS[0]
     """One of ``DECODERS``."""
     coding: str = AS_RECORDED
     """Coding of the output: one of ``CODINGS``, or ``AS_RECORDED``."""
     digests: bool = False
-    """True if digests of recordings' pictures, taken before encoding, are kept."""
+    """True to write a digest of every lit picture, computed before encoding."""
 
     def gpu_of(self, device: str) -> int | None:
-        """Return the index of the GPU that decodes for a worker on a device; None: the processor decodes."""
+        """Return the index of the GPU that decodes for a worker; None: the processor decodes.
+
+        Args:
+            device: Device of the worker, ``cpu`` or ``cuda:N``.
+        """
         return int(device.partition(":")[2] or 0) if self.decode == "gpu" and device.startswith("cuda") else None
 
 
@@ -65,15 +71,15 @@ class Clip:
     """One recording."""
 
     name: str
-    """Name of its files, unique among clips."""
+    """Name of the clip's outputs, unique among clips."""
     scene: str
-    """A scene file or a bundled scene's name."""
+    """Path of a scene file, or the name of a bundled scene."""
     source: Path | None = None
-    """Video or folder of frames in place of the scene's own."""
+    """Video or folder of frames; None: the scene's own."""
     light: Path | None = None
-    """Captured light in place of a mirror ball's."""
+    """File of captured light; None: the scene's own, or light that a mirror ball shows."""
     calibration: Path | None = None
-    """Calibration file in place of the scene's camera."""
+    """Calibration file of the camera; None: the scene's camera."""
     first: int = 0
     """Index of the first lit frame."""
     end: int | None = None
@@ -82,11 +88,12 @@ class Clip:
 
 @dataclasses.dataclass(frozen=True)
 class JobFile:
-    """The contents of a job file."""
+    """Contents of a job file."""
 
     settings: Settings
     clips: tuple[Clip, ...]
     dataset: Dataset | None
+    """Kinds of objects and lights of a data set; None if recordings are lit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,14 +112,17 @@ class Job:
     """Index after the last frame."""
 
     def key(self, jobs: JobFile) -> str:
-        """Return its name in the manifest."""
+        """Return the job's name in the manifest."""
         if self.kind == "index":
             return "dataset/index"
         name = jobs.clips[self.clip].name
         return f"{name}/{self.kind}" + (f"-{self.number:06d}" if self.kind in ("segment", "variation") else "")
 
     def place(self, jobs: JobFile) -> Path:
-        """Return the path of its result relative to the run's folder: a folder, or the last file of several."""
+        """Return the path of the job's result relative to the run's folder.
+
+        The result is a folder, or one or more files of which the returned one is written last.
+        """
         name = jobs.clips[self.clip].name
         match self.kind:
             case "survey":
@@ -142,7 +152,14 @@ def jobs_of_clip(jobs: JobFile, clip: int, length: int) -> int:
 
 
 def job_of_clip(jobs: JobFile, clip: int, number: int, length: int) -> Job:
-    """Return one of a clip's segments or variations; arguments as for ``jobs_of_clip``."""
+    """Return one of a clip's segments or variations.
+
+    Args:
+        jobs: The job file.
+        clip: Index of the clip.
+        number: Index of the segment or variation in the clip.
+        length: Number of frames of the clip's source.
+    """
     first, end = lit_range(jobs.clips[clip], length)
     if jobs.dataset is not None:
         return Job("variation", clip, number, first, end)
@@ -152,7 +169,11 @@ def job_of_clip(jobs: JobFile, clip: int, number: int, length: int) -> Job:
 
 
 def lit_range(clip: Clip, length: int) -> tuple[int, int]:
-    """Return the range of lit frames of a clip with ``length`` frames: first index, and index after the last.
+    """Return the range of a clip's lit frames: index of the first, and index after the last.
+
+    Args:
+        clip: The clip.
+        length: Number of frames of its source.
 
     Raises:
         JobsError: The range is empty.
@@ -164,7 +185,9 @@ def lit_range(clip: Clip, length: int) -> tuple[int, int]:
 
 
 def read_jobs(path: str | Path) -> dict[str, Any]:
-    """Return a job file as data, with patterns expanded to files and absolute paths.
+    """Return the content of a job file, in which patterns of clips are replaced by the matching files.
+
+    The key ``folder`` is added: the absolute path of the folder to which paths are relative.
 
     Raises:
         JobsError: The file cannot be read, or a pattern matches nothing.
@@ -183,7 +206,17 @@ def read_jobs(path: str | Path) -> dict[str, Any]:
 
 
 def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[str, Any]]:
-    """Return one entry for each file that a clip's path matches."""
+    """Return a table ``[[clip]]`` as one table for each file that its path, a pattern, matches.
+
+    Args:
+        label: Name of the job file in messages.
+        folder: Folder of the job file.
+        index: Index of the table.
+        clip: Content of the table.
+
+    Raises:
+        JobsError: The pattern matches no file, or several although the clip has a name.
+    """
     table = JobTable(label, folder, f"clip[{index}]", clip, _CLIP_KEYS)
     pattern = table.text("path", "")
     if not glob.has_magic(pattern) or (folder / pattern).exists():
@@ -232,10 +265,10 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
 
 
 def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None:
-    """Check that exposures do not depend on earlier frames that a job does not see.
+    """Check that the exposure in a job's frames does not depend on earlier frames, which the job does not read.
 
     Raises:
-        JobsError: An exposure does.
+        JobsError: The scene's metering or its scale of the exposure adapts over frames, which the settings cut.
     """
     settings = jobs.settings
     whole = settings.light == "preroll" and settings.segment_frames is None
@@ -263,7 +296,7 @@ def _read_settings(table: JobTable) -> Settings:
 
 
 def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:
-    """Return one clip; ``names`` counts the uses of each name."""
+    """Return one clip, and add its name to ``names``, which counts the uses of each name."""
     scene = table.text("scene", "desk")
     source, light, calibration = (table.path(key) for key in ("path", "light", "calibration"))
     if source is not None and not (is_file(source) or is_folder(source)):
@@ -296,7 +329,7 @@ def _load_scene(name: str) -> Scene:
 
 
 def scene_of(jobs: JobFile, clip: int) -> Scene:
-    """Return the scene of a clip, with its camera and its light.
+    """Return the scene of a clip, with the camera and the captured light that the clip names.
 
     Raises:
         SceneError: The scene cannot be used.
@@ -341,7 +374,7 @@ def inputs_of(jobs: JobFile, clip: int) -> list[Path]:
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """Data shared by all jobs of a run."""
+    """Data that a worker needs for every job of a run."""
 
     jobs: JobFile
     folder: Path
@@ -357,7 +390,7 @@ class Outcome:
     """Result of a job."""
 
     state: str
-    """State: ``done``, ``failed``, or ``full`` for a full disk."""
+    """State: ``done``, ``failed``, ``full`` (the disk is full), or ``lost`` (the worker died repeatedly)."""
     values: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Values for the job's line of the manifest."""
     reason: str = ""
@@ -373,7 +406,7 @@ def program_version() -> str:
     """Return the package's version, a digest of its code, and the libraries' versions, on one line."""
     root = Path(warp_ar.__file__).parent
     digest = hashlib.sha256()
-    for folder in (root, root / "kernels"):  # may be a link, which rglob does not follow
+    for folder in (root, root / "kernels"):  # kernels may be a link, which rglob does not follow
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     parts = [f"warp_ar {_version('warp-ar')} {digest.hexdigest()[:12]}"]

@@ -1,9 +1,9 @@
-"""Labels of every picture of a data set, in BOP's folders and files, with an additional COCO file.
+"""Labels of every picture of a data set, in the folders and files of the BOP benchmark, with an additional COCO file.
 
-A variation is a BOP scene: ``rgb``, ``depth``, ``mask`` (whole silhouettes) and ``mask_visib``, ``scene_gt.json``,
-``scene_gt_info.json`` and ``scene_camera.json``. Additional files are ``normals``, ``scene_light.json`` (the light of
-each frame), ``scene_gt_coco.json`` and ``scene.toml``, which ``python -m warp_ar.live`` can show. Masks, depth and
-normals are sampled at the pixel's centre.
+A variation is a BOP scene with the folders ``rgb``, ``depth``, ``mask`` (whole silhouettes) and ``mask_visib`` (visible
+parts), and the files ``scene_gt.json``, ``scene_gt_info.json`` and ``scene_camera.json``. In addition, there are the
+folder ``normals``, ``scene_light.json`` (the light of each frame), ``scene_gt_coco.json``, and ``scene.toml``, a scene
+file that ``python -m warp_ar.live`` can show. Masks, depth and normals are sampled at the pixel's centre.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from warp_ar.scene import Scene
 from warp_ar.signature import encode_png
 
 DEPTH_SCALE = 0.1
-"""Millimetres per step of a depth map; 0 means no modelled surface, or a depth above 6.5 m."""
+"""Millimetres per step of a depth map. The value 0 means that there is no modelled surface, or none within 6.5 m."""
 LAYERS = ("image", "ids", "depth", "normals")
-"""Outputs from which labels are made."""
+"""Outputs of the pipeline from which labels are made."""
 _THREADS = 2
 
 Mask = npt.NDArray[np.bool_]
@@ -46,18 +46,20 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclasses.dataclass(frozen=True)
 class _Pictures:
-    """Pictures of a frame by name."""
+    """Pictures of a frame, in the form of one picture for ``ThreadedSink``."""
 
     shape: tuple[int, ...]
+    """Shape of the lit picture."""
     files: dict[str, npt.NDArray[Any]]
+    """Pictures by their paths in the variation's folder, without suffix."""
 
     def copy(self) -> _Pictures:
-        """Return this object itself: nothing else refers to its arrays."""
+        """Return this object itself; no copy is needed, because nothing else refers to its arrays."""
         return self
 
 
 class LabelWriter(ThreadedSink):
-    """Writes the pictures and labels of one variation."""
+    """Writer of the pictures and labels of one variation."""
 
     def __init__(self, folder: Path, scene: Scene, kinds: Sequence[int], catalogue: Sequence[ObjectSpec]) -> None:
         """Make the folders.
@@ -80,11 +82,11 @@ class LabelWriter(ThreadedSink):
             (folder / name).mkdir()
 
     def label(self, lit: Lit, key: int | None) -> None:
-        """Add a frame that was just lit.
+        """Label a frame, and write its pictures on a thread.
 
         Args:
-            lit: The frame; its pipeline must not have lit another one since.
-            key: Index of the environment in the clip's survey; None: it is the same in all frames.
+            lit: The lit frame; its pipeline must not have lit another one since.
+            key: Index of the environment map in the clip's survey; None if all frames have one environment.
 
         Raises:
             SinkError: A file cannot be written.
@@ -129,7 +131,7 @@ class LabelWriter(ThreadedSink):
             store(self._folder / f"{name}.png", encode_png(picture, PNG_OPTIONS if picture.ndim == 3 else ()))
 
     def _trace(self, pipeline: Pipeline) -> npt.NDArray[np.uint64]:
-        """Return the objects that each pixel's ray meets, one bit per object."""
+        """Return the objects that the ray of each pixel hits, occluded or not, as one bit per object, (h, w)."""
         arrays = pipeline.arrays
         with exclusive(pipeline.device), wp.ScopedDevice(pipeline.device):
             if self._masks is None:
@@ -138,7 +140,13 @@ class LabelWriter(ThreadedSink):
             return np.array(self._masks.numpy())
 
     def _pose(self, lit: Lit, index: int, kind: int) -> dict[str, Any]:
-        """Return the pose from the model's to the camera's coordinates, in millimetres, as BOP writes it."""
+        """Return the pose of an object in a frame, ``camera_from_model`` in millimetres, in BOP's form.
+
+        Args:
+            lit: The frame.
+            index: Index of the object in the scene.
+            kind: Index of its kind in the catalogue.
+        """
         assert lit.pose is not None
         rotation, position = self._scene.objects[index].pose_at(lit.frame.time)
         placed = lit.pose.rotation @ rotation
@@ -225,12 +233,12 @@ class LabelWriter(ThreadedSink):
 
 
 def categories(catalogue: Sequence[ObjectSpec]) -> list[dict[str, Any]]:
-    """Return the categories of labels in COCO's form."""
+    """Return the catalogue's kinds of objects as categories in COCO's form."""
     return [{"id": index + 1, "name": spec.name, "supercategory": "object"} for index, spec in enumerate(catalogue)]
 
 
 def run_lengths(mask: Mask) -> list[int]:
-    """Return a mask as COCO's run lengths: column by column, beginning with the unset pixels."""
+    """Return the lengths of runs of equal pixels in a mask, column by column, beginning with unset pixels (COCO)."""
     flat = mask.T.ravel().view(np.uint8)
     ends = np.flatnonzero(np.diff(flat)) + 1
     counts = np.diff(np.concatenate([[0], ends, [len(flat)]])).tolist()
@@ -238,7 +246,13 @@ def run_lengths(mask: Mask) -> list[int]:
 
 
 def _info(whole: Mask, seen: Mask, measured: Mask) -> dict[str, Any]:
-    """Return BOP's numbers of one object in one picture; ``whole`` contains only its part inside the picture."""
+    """Return BOP's numbers of pixels and bounding boxes of one object in one picture.
+
+    Args:
+        whole: Silhouette of the object inside the picture.
+        seen: Visible part of the silhouette.
+        measured: Pixels with a depth.
+    """
     pixels, visible = int(whole.sum()), int(seen.sum())
     return {
         "bbox_obj": _box(whole),
@@ -292,8 +306,8 @@ def write_dataset_files(jobs: JobFile, places: Sequence[Path], folder: Path, run
 
 
 def _model(spec: ObjectSpec) -> Any:
-    """Return the triangles of an object in millimetres, relative to the origin of its pose."""
-    import trimesh  # imported here: no other job needs it
+    """Return the scaled triangles of an object in millimetres, in the object's frame."""
+    import trimesh  # imported here, because no other job needs it
 
     made = mesh_of(spec.item)
     vertices = 1e3 * spec.item.scale * made.vertices
@@ -301,7 +315,7 @@ def _model(spec: ObjectSpec) -> Any:
 
 
 def _write_models(catalogue: Sequence[ObjectSpec], folder: Path) -> None:
-    """Write one PLY for each object, and their sizes in BOP's form."""
+    """Write one PLY file for each kind of object, and the sizes of all in BOP's form."""
     folder.mkdir()
     table = {}
     for number, spec in enumerate(catalogue, 1):
@@ -320,7 +334,10 @@ def _write_models(catalogue: Sequence[ObjectSpec], folder: Path) -> None:
 
 
 def _diameter(vertices: Any) -> float:
-    """Return the largest distance of two points in millimetres; only extreme points in many directions are compared."""
+    """Return the largest distance between two vertices in millimetres.
+
+    Only vertices that are extreme in one of 2000 directions are compared.
+    """
     golden = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(2000)
     z = 1.0 - (np.arange(2000) + 0.5) / 1000.0
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(golden), np.sqrt(1 - z * z) * np.sin(golden), z])
@@ -334,7 +351,17 @@ def _variations(places: Sequence[Path], run: Path) -> Iterator[tuple[Path, dict[
 
 
 def _write_coco(dataset: Dataset, places: Sequence[Path], path: Path, run: Path) -> collections.Counter[str]:
-    """Merge the COCO files of all variations, one at a time, with consecutive numbers."""
+    """Merge the COCO files of all variations into one, with consecutive numbers, holding one file in memory at a time.
+
+    Args:
+        dataset: Kinds of objects and lights.
+        places: Folders of the variations, relative to the run's folder.
+        path: File to write.
+        run: Folder of the run.
+
+    Returns:
+        Number of ``pictures``, of ``labels``, and of labels of each ``category N``.
+    """
     counts: collections.Counter[str] = collections.Counter()
     annotations = path.with_suffix(".part")
     with open(path, "w", encoding="utf-8") as images, open(annotations, "w+", encoding="utf-8") as labels:
@@ -406,7 +433,7 @@ and by virtual lights. Labels come from the geometry that was rendered; nobody d
 def _datasheet(
     jobs: JobFile, dataset: Dataset, places: Sequence[Path], counts: collections.Counter[str], version: str
 ) -> str:
-    """Return the datasheet: contents, production and limits of the data set."""
+    """Return the text of the datasheet: contents, origin and limits of the data set."""
     rows = (
         f"| {number} | {spec.name} | {spec.item.shape} | {counts[f'category {number}']} |"
         for number, spec in enumerate(dataset.catalogue, 1)

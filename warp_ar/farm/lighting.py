@@ -26,21 +26,22 @@ from warp_ar.sources.source import Frame, RecordedSource
 from warp_ar.tracking.tracking import given_pose
 
 PIPELINES = 4
-"""Number of pipelines that are kept for scenes with different objects; each holds its arrays."""
+"""Largest number of pipelines that are kept for scenes with different objects; each holds arrays of its own."""
 
 Image = npt.NDArray[np.uint8]
 
 
 @dataclasses.dataclass(frozen=True)
 class Lit:
-    """A frame with its pose and its result."""
+    """Frame with its pose and its result."""
 
     frame: Frame
     pose: Pose | None
-    """Pose from the survey; None if the marker was lost, or if the pipeline finds the pose."""
+    """Pose from the survey; None if the marker was lost, or if the pipeline tracks the marker itself."""
     result: Result | None
-    """Result of the pipeline; None if the marker was lost, so that the frame stays unlit."""
+    """Result of the pipeline; None if the marker was lost, so that the frame is written without virtual objects."""
     pipeline: Pipeline
+    """Pipeline that lit the frame."""
 
     @property
     def image(self) -> Image:
@@ -49,7 +50,7 @@ class Lit:
 
     @property
     def radiance(self) -> npt.NDArray[np.float32]:
-        """Picture as linear radiance, float32 RGB (height, width, 3), if ``light`` was called with that output."""
+        """The picture as linear radiance, float32 RGB (height, width, 3); only if this output was requested."""
         if self.result is not None:
             return self.result.radiance
         deep = self.frame.deep
@@ -58,10 +59,10 @@ class Lit:
 
 
 class Lighter(Closing):
-    """Lights segments and variations; each worker has one."""
+    """Lighting of a worker's segments and variations."""
 
     def __init__(self, jobs: JobFile, folder: Path, device: str) -> None:
-        """Take the job file without opening a pipeline.
+        """Store the job file; pipelines are made when they are needed.
 
         Args:
             jobs: The job file.
@@ -87,7 +88,9 @@ class Lighter(Closing):
     def light(
         self, job: Job, scene: Scene | None = None, *, outputs: tuple[str, ...] = ("image",), every: int = 1
     ) -> Iterator[Lit]:
-        """Yield the lit frames of a job; if only pictures are requested, the next frame is begun before one is yielded.
+        """Yield the lit frames of a job.
+
+        If only pictures are requested, a frame is yielded after the next one was begun, so that both overlap.
 
         Args:
             job: A segment or a variation.
@@ -112,7 +115,7 @@ class Lighter(Closing):
             yield before
 
     def _light_surveyed(self, job: Job, scene: Scene | None, outputs: tuple[str, ...], every: int) -> Iterator[Lit]:
-        """Light frames with poses and light of their clip's survey, each when it is requested."""
+        """Yield frames that are lit with the poses and the light of their clip's survey."""
         survey = self.survey(job.clip)
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
         with contextlib.closing(self._open(job, job.first)) as source:
@@ -133,7 +136,10 @@ class Lighter(Closing):
                 yield Lit(frame, pose, result, pipeline)
 
     def _light_alone(self, job: Job, scene: Scene | None, outputs: tuple[str, ...], every: int) -> Iterator[Lit]:
-        """Light a segment that finds its own light and track, from the frames before it on."""
+        """Yield the frames of a segment, lit by a pipeline that tracks the marker and captures the light itself.
+
+        The pipeline begins ``preroll`` frames before the segment.
+        """
         own = scene_of(self._jobs, job.clip) if scene is None else scene
         first, _ = lit_range(self._jobs.clips[job.clip], self.survey(job.clip).index.length)
         with (
@@ -160,19 +166,19 @@ class Lighter(Closing):
         return open_part(path, self.survey(job.clip).index, first, job.end, fps, gpu)
 
     def _options(self) -> dict[str, Any]:
-        """Return the arguments that all pipelines share."""
+        """Return the arguments of ``Pipeline`` that are equal for all jobs."""
         return {"device": self._device, "quality": self._jobs.settings.quality, "estimates": "synchronous"}
 
     def _pipeline_for(
         self, scene: Scene, source: RecordedSource, outputs: tuple[str, ...], *, follows: bool
     ) -> Pipeline:
-        """Return a pipeline for a scene; an existing one if only numbers differ.
+        """Return a pipeline for a scene: an existing one if its scene differs only in numbers, else a new one.
 
         Args:
             scene: Scene to show.
             source: Source of the frames.
             outputs: Outputs of the pipeline.
-            follows: Whether poses and light come from a survey.
+            follows: True if each frame is lit with a map of the survey.
         """
         size, linear = source.size, keep_depth(source, scene)
         key = skeleton(scene), size, outputs, follows, linear
@@ -190,5 +196,8 @@ class Lighter(Closing):
 
 
 def _call(pipeline: Pipeline) -> Any:
-    """Return the function that lights a frame: ``submit`` if only pictures are requested, else a call."""
+    """Return the function that lights a frame.
+
+    It is ``submit``, which does not wait for the result, if only pictures are requested; else the pipeline itself.
+    """
     return pipeline.submit if pipeline.plan.request.outputs == ("image",) else pipeline

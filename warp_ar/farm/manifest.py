@@ -1,9 +1,10 @@
 """Persistent record of a run, so that after a crash nothing is lost or repeated.
 
 ``manifest.jsonl`` has a line for each job that is done or has failed for good, and for each failed attempt. A line is
-appended by one write and synchronised; an incomplete line after a crash is removed when the file is opened. A job
-writes its outputs to a temporary folder and renames it when they are complete. They include a ``record.json`` that
-names the job: outputs without a line are added to the manifest, and a line without outputs is ignored.
+appended by one write and synchronised to the disk. An incomplete line after a crash is removed when the file is opened.
+A job writes its outputs to a temporary folder, which is renamed when they are complete. The outputs include a
+``record.json`` that names the job. If a crash leaves complete outputs without a line, the line is added. If the outputs
+of a line are missing, the job is repeated.
 
 Only one driver at a time works on a run: it locks the folder, and the lock ends with its process.
 """
@@ -30,13 +31,14 @@ from warp_ar.files import kind_of, parse_json, read_bytes, take_name, write_whol
 
 MANIFEST, RUN, LOCK, RECORD = "manifest.jsonl", "run.json", "lock", "record.json"
 ASIDE = ".aside"
-"""Folder of incomplete outputs."""
+"""Folder of the temporary folders with incomplete outputs."""
 _NUMBERS = ("frames", "bytes", "length", "jobs", "seconds", "ended", "worker")
-"""Numeric values of the line of a finished job."""
+"""Numeric values that the line of a finished job may have."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+"""Error numbers of a full disk."""
 
 LOCK_SECONDS = 1.0
-"""Seconds within which a lock must become free; a status request may hold it briefly."""
+"""Longest time in seconds that a driver waits for the lock; the command ``status`` holds it for a moment."""
 
 
 class RunError(WarpArError):
@@ -44,14 +46,14 @@ class RunError(WarpArError):
 
 
 class Manifest:
-    """Lines of a run's manifest and the state that they give."""
+    """Manifest of a run: its file, and the states of the jobs."""
 
     def __init__(self, folder: Path, *, write: bool) -> None:
         """Read the existing lines.
 
         Args:
             folder: Folder of the run.
-            write: Whether lines will be added; otherwise an incomplete last line is left unchanged.
+            write: True to add lines, and to remove an incomplete last line.
 
         Raises:
             RunError: The manifest cannot be read, or a line before the last is damaged.
@@ -101,7 +103,12 @@ class Manifest:
                 self.done.pop(key, None)
 
     def add(self, state: str, key: str, **values: Any) -> None:
-        """Append a line with the state ``done``, ``failed``, ``try``, or ``again`` for a job whose outputs are missing.
+        """Append a line.
+
+        Args:
+            state: ``done``, ``failed`` (for good), ``try`` (an attempt has failed) or ``again`` (the job is repeated).
+            key: Key of the job.
+            values: Further values of the line.
 
         Raises:
             RunError: The line cannot be written; the file is unchanged.
@@ -131,7 +138,7 @@ def parse_line(line: bytes) -> dict[str, Any]:
     """Return a line of a manifest as data.
 
     Raises:
-        ValueError: It is no valid line.
+        ValueError: The line is not valid.
     """
     try:
         told = json.loads(line)
@@ -171,10 +178,10 @@ def read_kept(path: Path) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Context that holds the lock of a run.
+    """Context in which this process holds the lock of a run.
 
     Raises:
-        RunError: Another driver holds it.
+        RunError: Another driver holds the lock, or the folder's disk has no locks.
     """
     lock = filelock.FileLock(folder / LOCK, timeout=LOCK_SECONDS, mode=0o666)
     try:
@@ -204,7 +211,12 @@ def is_locked(folder: Path) -> bool:
 
 
 def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
-    """Make a run's folder, and write its jobs and the version.
+    """Make a run's folder, and write the jobs and the program's version.
+
+    Args:
+        folder: The folder, new or empty.
+        data: Content of the job file.
+        version: Version of the program.
 
     Raises:
         UsageError: The folder is not empty.
@@ -226,7 +238,7 @@ def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
 
 
 def load_run(folder: Path) -> tuple[dict[str, Any], str]:
-    """Return the jobs of a run, and the version of the program that began it.
+    """Return the content of a run's job file, and the version of the program that began the run.
 
     Raises:
         UsageError: The folder has no run.
@@ -255,7 +267,12 @@ def clear_aside(folder: Path) -> None:
 
 @contextlib.contextmanager
 def aside(folder: Path, token: str) -> Iterator[Path]:
-    """Yield an empty folder for incomplete outputs; on exit it is removed if it was not renamed."""
+    """Yield an empty temporary folder for outputs; on exit it is removed unless it was renamed.
+
+    Args:
+        folder: Folder of the run.
+        token: Beginning of the temporary folder's name.
+    """
     path = folder / ASIDE / f"{token}.{secrets.token_hex(4)}"
     path.mkdir(parents=True)
     try:
@@ -265,16 +282,19 @@ def aside(folder: Path, token: str) -> Iterator[Path]:
 
 
 def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Move a folder of outputs to its place; if another worker's outputs are there, they stay, because they are equal.
+    """Move a folder of outputs to its final path.
+
+    If outputs of another worker for this job are there already, they stay, because they are equal.
 
     Args:
-        part: Folder of outputs, on the same disk.
+        part: Folder of outputs, on the disk of the final path.
         place: Final path.
         key: Key of the job.
-        values: Further values of the job's line, for a later driver if this one cannot write the line.
+        values: Further values of the job's line in the manifest. They are written to the record, so that a later driver
+            can add the line if this one dies before it does.
 
     Returns:
-        The values, with the size in bytes, and a digest of names and contents.
+        The values, the key, the size in bytes, and a digest of names and contents.
     """
     size, digest = 0, hashlib.sha256()
     for path in sorted(path for path in part.rglob("*") if path.is_file()):
@@ -314,7 +334,7 @@ def _sync_folder(path: Path) -> None:
 
 
 def record_at(place: Path, key: str) -> dict[str, Any] | None:
-    """Return the record in the outputs of a job; None if there is none."""
+    """Return the record in a folder of outputs; None if it has none of the job with this key."""
     told = read_kept(place / RECORD)
     return told if told is not None and told.get("job") == key else None
 
@@ -336,9 +356,12 @@ def describe_inputs(paths: Iterable[Path]) -> dict[str, list[Any]]:
 
 
 def changed_input(inputs: Mapping[str, Sequence[Any]]) -> str | None:
-    """Return a message that names a changed file of ``describe_inputs``; None if all are unchanged.
+    """Return a message that names a changed file; None if all are unchanged.
 
-    A file is read only if its modification time differs.
+    A file is read only if its size is unchanged and its modification time differs.
+
+    Args:
+        inputs: Result of ``describe_inputs`` for the files.
     """
     for name, (size, changed, digest) in inputs.items():
         try:
@@ -365,7 +388,7 @@ PACE = 50
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """Return the finished, failed and open jobs of a run.
+    """Return the progress of a run, as data for JSON: jobs by state, frames, bytes, rates of workers and time left.
 
     Raises:
         UsageError: The folder has no run.

@@ -16,20 +16,20 @@ from warp_ar.farm.pools import cores_of, keeping_to
 from warp_ar.farm.work import Work
 
 PROBES = 3
-"""Number of clips of which a job is tried."""
+"""Largest number of clips of which a job is tried."""
 FRAMES = 16
-"""Number of frames of each trial."""
+"""Largest number of frames of each trial."""
 
 
 def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Count jobs and try a few, on the first worker's device.
+    """Count jobs, try a few on the first worker's device, and estimate time and size of the run.
 
     Args:
         jobs: The job file.
         devices: Device of each planned worker.
 
     Returns:
-        Numbers of jobs, times and sizes in words; and reasons why clips cannot be read.
+        Lines with numbers of jobs, times and sizes; and lines with the reasons why clips cannot be read.
 
     Raises:
         RunError: No job can be tried.
@@ -64,7 +64,7 @@ def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[st
         f"a frame: {frame_ms:.1f} ms lit and written, {survey_ms:.1f} ms surveyed, at quality {jobs.settings.quality} "
         f"on {devices[0]}",
     ]
-    # Workers that share a core are together no faster than one that has it; a clip is surveyed by one worker.
+    # Workers that share a core count as one. A clip is surveyed by one worker.
     at_once = len({core for own in cores for core in own} or devices) if devices[0] == "cpu" else len(devices)
     for workers in sorted({1, len(devices)}):
         busy = min(workers, at_once)
@@ -75,10 +75,21 @@ def tell_plan(jobs: JobFile, devices: Sequence[str]) -> tuple[list[str], list[st
 
 
 def _try(jobs: JobFile, clip: int, length: int, device: str) -> tuple[float, float, float, float]:
-    """Do the first job of a clip on a few frames, twice: the second time everything is compiled and cached.
+    """Do the survey and the first job of a clip on a few frames, twice each, and time the second.
+
+    In the first, kernels are compiled and files are cached.
+
+    Args:
+        jobs: The job file.
+        clip: Index of the clip.
+        length: Number of frames of its source.
+        device: ``cpu`` or ``cuda:N``.
 
     Returns:
         Milliseconds per surveyed and per lit frame; bytes per lit and per surveyed frame.
+
+    Raises:
+        RunError: A job fails.
     """
     first, end = lit_range(jobs.clips[clip], length)
     few = dataclasses.replace(jobs.clips[clip], end=min(end, first + FRAMES))

@@ -1,7 +1,7 @@
 """Workers of a run: processes of this machine, each on its own cores, or actors of a Ray cluster.
 
-A worker receives jobs and returns records; frames never pass through a pool. Each worker has its own executor of one
-process, so that its death only loses its own job. BLAS and OpenCV use one thread each, so that results do not depend on
+A worker receives jobs and returns records; frames never pass through a pool. Each process has an executor of its own,
+so that its death loses only one job. BLAS and OpenCV use one thread in every worker, so that results do not depend on
 the number of workers.
 """
 
@@ -29,15 +29,15 @@ from warp_ar.farm.jobs import Context, Job, Outcome, program_version
 from warp_ar.farm.manifest import RunError
 
 CORES = 4
-"""Processor cores of a worker on CPU; stages with few rows cannot use more."""
+"""Number of processor cores per worker on CPU; stages with few rows cannot use more."""
 GPU_CORES = 2
-"""Processor cores of a worker on a GPU, for decoding and encoding."""
+"""Number of processor cores per worker on a GPU, for decoding and encoding."""
 MOST_OF_GPU = 16
-"""Default number of workers on a GPU; each holds its arrays there."""
+"""Largest default number of workers on a GPU; each holds arrays of its own there."""
 DEATHS = 5
-"""Number of times that a job's worker may die before the job has failed."""
+"""Number of deaths of its worker after which a job has failed."""
 STARTS = 3
-"""Number of times in a row that a worker may die before it is ready."""
+"""Number of consecutive deaths of a starting worker after which the run ends."""
 CONNECT_SECONDS = 30.0
 """Seconds within which a cluster must answer."""
 KNOCK_SECONDS = 5.0
@@ -45,11 +45,12 @@ KNOCK_SECONDS = 5.0
 
 
 def devices_of(device: str, workers: int | None) -> list[str]:
-    """Return the device of each worker, with GPUs in turn.
+    """Return the device of each worker; GPUs are assigned to the workers in turn.
 
     Args:
         device: ``auto``, ``cpu`` or ``cuda``.
-        workers: Number of workers; None: one per four cores on CPU, or per two on GPUs, and at least one for each GPU.
+        workers: Number of workers. None: on CPU, one per ``CORES`` cores; on GPUs, one per ``GPU_CORES`` cores, but at
+            least one and at most ``MOST_OF_GPU`` for each GPU.
     """
     from warp_ar.device import resolve_device
 
@@ -64,10 +65,13 @@ def devices_of(device: str, workers: int | None) -> list[str]:
 
 
 def cores_of(devices: Sequence[str]) -> list[list[int]]:
-    """Return the cores of each worker; empty if the system cannot bind a process to cores.
+    """Return the numbers of each worker's cores; empty lists if the system cannot bind a process to cores.
 
-    On CPU each worker has its own cores, evenly distributed, or shared ones if there are more workers than cores.
-    Workers of one GPU share the cores of that GPU: while one waits for GPU or encoder, another runs.
+    On CPU the cores are divided evenly; if there are more workers than cores, some share a core. On GPUs the cores are
+    divided among the GPUs, and the workers of one GPU share its cores: while one waits, another runs.
+
+    Args:
+        devices: Device of each worker.
     """
     if not hasattr(os, "sched_getaffinity"):
         return [[] for _ in devices]
@@ -82,7 +86,7 @@ def cores_of(devices: Sequence[str]) -> list[list[int]]:
 
 @contextlib.contextmanager
 def keeping_to(cores: Sequence[int]) -> Iterator[None]:
-    """Context in which started threads are bound to the given cores; without cores it does nothing."""
+    """Context in which this thread, and those that it starts, are bound to cores; without cores it does nothing."""
     if not cores or not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -101,16 +105,26 @@ class Pool(ABC):
         """Start the threads for ``size`` workers."""
         self.size = size
         self._closed = False
-        multiprocessing.resource_tracker.ensure_running()  # here, because its start unblocks interrupts
+        # The tracker is started before interrupts are blocked in the threads, because its start unblocks them.
+        multiprocessing.resource_tracker.ensure_running()
         self._threads = [ThreadPoolExecutor(1, "warp_ar-worker", initializer=_hold_interrupts) for _ in range(size)]
 
     def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
-        """Submit a job to an idle worker; the future raises RunError if the run cannot go on."""
+        """Submit a job to an idle worker.
+
+        Args:
+            worker: Index of the worker.
+            job: The job.
+            arguments: Further data for the job.
+
+        Returns:
+            Future of the outcome; it raises RunError if the run cannot go on.
+        """
         return self._threads[worker].submit(self._do, worker, job, arguments)
 
     @abstractmethod
     def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
-        """Have a job done; its state is ``lost`` if its workers die repeatedly."""
+        """Have a job done by a worker and return its outcome; the state is ``lost`` if the worker dies repeatedly."""
 
     @abstractmethod
     def _end(self) -> None:
@@ -125,7 +139,7 @@ class Pool(ABC):
 
 
 def _hold_interrupts() -> None:
-    """Block the terminal's interrupts in processes that this thread starts; the driver handles them."""
+    """Block the terminal's interrupts in processes that this thread starts; only the driver handles them."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
@@ -148,7 +162,11 @@ class ProcessPool(Pool):
             thread.submit(self._ready, worker)
 
     def _ready(self, worker: int) -> ProcessPoolExecutor:
-        """Return a worker's executor when it is ready; raise RunError if it dies before that repeatedly."""
+        """Return a worker's executor when it is ready.
+
+        Raises:
+            RunError: The worker has died repeatedly before it was ready.
+        """
         for _ in range(STARTS):
             if worker not in self._executors:
                 context = dataclasses.replace(self._context, device=self._devices[worker], worker=worker)
@@ -197,7 +215,13 @@ _worker: tuple[Any, Sequence[int]] | None = None
 
 
 def _begin(context: Context, cores: Sequence[int], every: Sequence[int]) -> None:
-    """Make this process a worker, which ends with its driver, is bound to its cores and writes to its log."""
+    """Make this process a worker, which ends with its driver, is bound to its cores and writes to a log.
+
+    Args:
+        context: Context of the run for this worker.
+        cores: Numbers of the worker's cores.
+        every: Numbers of the cores of all workers.
+    """
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_driver, name="warp_ar-driver", daemon=True).start()
@@ -217,7 +241,7 @@ def _end_with_driver() -> None:
 
 
 def _do(job: Job, arguments: Any) -> Outcome:
-    """Do a job in this worker's process; a survey may use the cores of all workers, which wait for its result."""
+    """Do a job in this worker's process; a survey may use the cores of all workers, because others wait for it."""
     assert _worker is not None
     work, every = _worker
     with keeping_to(every if job.kind == "survey" else ()):
@@ -267,7 +291,7 @@ class RayPool(Pool):
         from warp_ar.farm.work import Work
 
         needs = {"num_gpus": share_of_gpu(self.size, self._gpus)} if self._gpus else {"num_cpus": 1}
-        # After a node is lost, the actor is restarted there or on another node, and its job repeated.
+        # If an actor or its node is lost, Ray restarts the actor on any node and repeats its job.
         actor = self._ray.remote(Work).options(max_restarts=-1, max_task_retries=DEATHS, **needs)
         device = "cuda" if self._gpus else "cpu"
         for worker in range(self.size):
@@ -291,13 +315,19 @@ class RayPool(Pool):
 
 
 def share_of_gpu(workers: int, gpus: int) -> float:
-    """Return the share of a GPU for each worker, so that all fit; Ray counts in ten-thousandths."""
+    """Return the share of a GPU for each worker, rounded down to Ray's unit of 1/10,000 so that all workers fit."""
     on_one = -(-workers // gpus)
     return 1 if on_one == 1 else math.floor(1e4 / on_one) / 1e4
 
 
 def _connect(ray: Any, address: str | None) -> None:
-    """Connect to a cluster within a limited time: Ray takes half a minute to report that there is none."""
+    """Connect to a cluster within a limited time.
+
+    The host is tried first, because Ray takes half a minute to report that no cluster answers.
+
+    Raises:
+        UsageError: No cluster answers at the address.
+    """
     options = {"logging_level": "ERROR", "log_to_driver": False}
     if address is None:
         try:

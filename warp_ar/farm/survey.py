@@ -1,26 +1,28 @@
 """Survey of a clip: a first, cheap pass that finds the camera's pose in every frame and the light.
 
-All segments and variations of the clip use it. With given poses and light, a frame's picture does not depend on the
-frames lit before it. The file is a ZIP of NumPy arrays for ``numpy.load``:
+All segments and variations of the clip use its survey. With given poses and light, a frame's picture does not depend on
+the frames lit before it. ``survey.npz`` holds arrays for ``numpy.load``:
 
 - ``ticks`` (n,) int64 and ``tick`` (2,) int64: time stamps of frames, and the seconds of a tick as a fraction;
+- ``seekable`` bool: True if the time stamps are those of the file;
 - ``poses`` (n, 12) float64: ``camera_from_world``, R by rows and t in metres; NaN where the marker was lost;
-- ``saturation`` (3,) float64: codes at which the camera's channels saturate;
+- ``saturation`` (3,) float64: 8-bit codes at which the camera's channels saturate;
 - ``size`` (2,) int64: width and height of the frames in pixels;
 - ``coding`` str: coding of a video at the recording's own bit depth;
-- ``keys`` (k,) int64: index of the frame from which each of the k maps is used;
-- ``places`` (k + 1,) int64: offset in ``lights.bin`` of each map, and the end of the last.
+- ``keys`` (k,) int64: index of the frame from which each of the k environment maps is used;
+- ``places`` (k + 1,) int64: offset in ``lights.bin`` of each map, and the end of the last;
+- ``shape`` (3,) int64: shape of every map.
 
-``lights.bin`` contains the maps one after another, so that reading one does not depend on their number. Each is a zlib
-stream of a map, float32 (h, 2 h, 3), followed by its emitters if the quality finds their positions, both as written by
-``numpy.save``.
+``lights.bin`` contains the maps one after another, so that the time to read one does not depend on their number. Each
+is a zlib stream of the bytes of a map, float32 (h, 2 h, 3), followed by those of its emitters if the quality finds
+their positions.
 
-A key is written when a texel of the environment has changed by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE
-* value``) since the last key.
+A new map, called a key, is written when the emitters have changed, or when a texel of the environment has changed since
+the last key by more than ``CHANGE_FLOOR + CHANGE_SHARE * value``, about one 8-bit step.
 
-Poses and light of a frame depend on the frames before it, so a clip is surveyed in order. While the marker of a frame
-is searched for, kernels process the light of the previous one, and a thread compares and compresses that of earlier
-ones.
+Poses and light of a frame depend on the frames before it, so a clip is surveyed in order. Three steps run in parallel:
+the search for the marker in a frame, the light of the frame before it, and on a thread the comparison and compression
+of the light of earlier frames.
 """
 
 from __future__ import annotations
@@ -63,16 +65,18 @@ LIGHT = "light.exr"
 WAITING = 4
 """Largest number of frames whose light waits to be compared with the last key."""
 CHANGE_FLOOR = 0.0005
+"""Absolute part of a texel's change beyond which a new map is written."""
 CHANGE_SHARE = 0.01
-"""Relative change of a texel from which on a new map is written, about one 8-bit step. Until then, any normalised
-filter F of the map with weights that are not negative is off by at most ``CHANGE_FLOOR + CHANGE_SHARE * F``."""
+"""Relative part of a texel's change beyond which a new map is written, about one 8-bit step. Until then, a filtered
+value F of the map is off by at most ``CHANGE_FLOOR + CHANGE_SHARE * F``, if the filter's weights are not negative and
+sum to 1."""
 _MANTISSA = 12
-"""Mantissa bits of stored radiance: the relative error of 2^-13 is a hundredth of a key's tolerance. Further bits are
-noise that does not compress."""
+"""Number of mantissa bits of stored radiance. The relative error of 2^-13 is a hundredth of ``CHANGE_SHARE``; further
+bits are noise, which does not compress."""
 
 
 class Survey:
-    """Result of a survey; maps are read on demand."""
+    """Survey of a clip, read from its files; maps are read on demand."""
 
     def __init__(self, folder: Path) -> None:
         """Open the survey in a folder.
@@ -105,11 +109,17 @@ class Survey:
         return None if np.isnan(row[0]) else Pose(row[:9].reshape(3, 3), row[9:])
 
     def key_of(self, frame: int) -> int:
-        """Return the index of the map for a frame."""
+        """Return the index of the environment map for a frame."""
         return max(int(np.searchsorted(self.keys, frame, side="right")) - 1, 0)
 
     def light(self, key: int) -> tuple[Map, npt.NDArray[Any] | None]:
-        """Return a map, float32 (h, 2 h, 3), and its emitters as records of ``Emitter``; None if they are not known.
+        """Return an environment map and its emitters.
+
+        Args:
+            key: Index of the map.
+
+        Returns:
+            Radiance, float32 (h, 2 h, 3); and records of ``Emitter``, or None if the emitters are not known.
 
         Raises:
             SourceError: The map is damaged or missing.
@@ -137,7 +147,8 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
         device: ``cpu`` or ``cuda:N``.
 
     Returns:
-        Number of frames of the clip, and of those in which the marker was found.
+        Values for the manifest: numbers of frames (``length``), jobs, frames with a pose (``found``) and maps
+        (``keys``), and the ``inputs`` that were read.
 
     Raises:
         WarpArError: The clip or its scene cannot be used.
@@ -191,16 +202,20 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
 
 @dataclasses.dataclass
 class _Look:
-    """Poses and light, collected while frames are lit."""
+    """Poses and light, collected over the frames of a survey."""
 
     light: str
     """One of ``LIGHTS``."""
     maps: BinaryIO
     """File of the maps."""
     poses: npt.NDArray[np.float64]
+    """Poses in the form of the module's ``poses``, (n, 12)."""
     keys: list[int] = dataclasses.field(default_factory=list)
+    """Index of the frame from which each map is used."""
     places: list[int] = dataclasses.field(default_factory=lambda: [0])
+    """Offset in the file of each map, and the end of the last."""
     saturation: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.full(3, 255.0))
+    """8-bit codes at which the camera's channels saturate, (3,)."""
     latest: tuple[Map, npt.NDArray[Any] | None] | None = None
     """Environment and emitters of the last frame with a marker."""
     kept: tuple[Map, npt.NDArray[Any] | None] | None = None
@@ -209,9 +224,9 @@ class _Look:
     """Shape of every map."""
 
     def take(self, frame: int, result: Result) -> None:
-        """Wait for the pose and the light of a frame; call ``keep`` if the light of every frame is stored."""
+        """Wait for the pose and the light of a frame, and store them; the light only if it follows each frame."""
         if result.pose is None:
-            _ = result.stages  # waits, and raises errors of the frame
+            _ = result.stages  # waits for the frame, and raises its errors
             return
         self.poses[frame] = (*result.pose.rotation.ravel(), *result.pose.translation)
         self.latest = None if result.environment is None else (result.environment, result.emitters)
@@ -219,7 +234,7 @@ class _Look:
             self.keep(frame, *self.latest)
 
     def keep(self, frame: int, environment: Map, emitters: npt.NDArray[Any] | None) -> None:
-        """Write an environment as a key if it or its emitters have changed since the last key."""
+        """Write an environment map for the frames from ``frame`` on, if it or its emitters have changed enough."""
         if self.kept is not None:
             last, before = self.kept
             same = emitters is None or (before is not None and emitters.tobytes() == before.tobytes())
@@ -235,7 +250,16 @@ class _Look:
 def _look_at_frames(
     scene: Scene, source: RecordedSource, look: _Look, quality: str, device: str, *, captures: bool
 ) -> None:
-    """Track the camera and, if ``captures``, measure the light; a thread compresses the light of earlier frames."""
+    """Track the camera in all frames and, if ``captures``, measure the light; store both in ``look``.
+
+    Args:
+        scene: Scene of the clip.
+        source: The clip's frames.
+        look: Poses and light to be filled in.
+        quality: Name of a quality preset.
+        device: ``cpu`` or ``cuda:N``.
+        captures: True to measure the light.
+    """
     with contextlib.closing(source), ThreadPoolExecutor(1, "warp_ar-survey") as packer:
         linear = keep_depth(source, scene)
         pipeline = Pipeline(
@@ -263,7 +287,7 @@ def _look_at_frames(
 
 
 def keep_depth(source: RecordedSource, scene: Scene) -> bool:
-    """Have a source keep the full bit depth of its pictures; return True if they have more than 8 bits.
+    """Make a source yield deep frames if its pictures have more than 8 bits, and return True if they have.
 
     Raises:
         UsageError: The pictures are linear, which does not fit the camera's transfer function.
@@ -275,7 +299,7 @@ def keep_depth(source: RecordedSource, scene: Scene) -> bool:
 
 
 def _rounded(values: Map) -> Map:
-    """Return values with the lowest bits of the mantissa rounded off."""
+    """Return values rounded to ``_MANTISSA`` bits of the mantissa."""
     drop = 23 - _MANTISSA
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
     return ((bits + np.uint32(1 << (drop - 1))) & np.uint32(0xFFFFFFFF << drop & 0xFFFFFFFF)).view(np.float32)

@@ -1,9 +1,9 @@
 """Segments as videos, and their concatenation to one recording without re-encoding.
 
 Frames keep the time stamps of their recording, so that a variable frame rate is preserved and the recording's sound
-fits. Segments have no B-frames: the decoding time of each packet then equals its presentation time, and packets of one
-segment can follow those of another at any times. The number of the encoder's threads is fixed, because the encoded
-bytes depend on it.
+stays synchronous. Segments have no B-frames. The decoding time of each packet therefore equals its presentation time,
+and packets of one segment can directly follow those of another. The number of the encoder's threads is fixed, because
+the encoded bytes depend on it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ from warp_ar.signature import PROGRAM
 ENCODER_THREADS = 2
 """Number of threads of x264 and x265, the same on every machine."""
 _X264 = "rc-lookahead=10:mbtree=1"
-"""Options of preset `veryfast` that give x264's `superfast` the same lookahead. It still omits subpixel motion search:
-three fifths of the processor time, for a twentieth more bytes and 0.1 codes of error."""
+"""Options that give x264's preset ``superfast`` the lookahead of ``veryfast``. It still omits the search for subpixel
+motion. Compared with ``veryfast``, it takes three fifths of the processor time, writes a twentieth more bytes and errs
+by 0.1 codes more."""
 _X265 = f"pools=none:frame-threads={ENCODER_THREADS}:open-gop=0"
 """Options of x265 without its thread pool, which depends on the number of cores; only frame threads are used."""
 _MOST_SCALE = 100_000_000
+"""Largest number of time units per second in a file's header."""
 _LANGUAGES = ("language", "title", "handler_name")
-"""Metadata of a stream that remain valid in another file."""
+"""Names of a stream's metadata that remain valid in another file."""
 
 
 def part_encoding(coding: str = "8bit") -> Encoding:
@@ -57,9 +59,9 @@ def open_part_sink(path: Path, tick: fractions.Fraction, fps: float, coding: str
     Args:
         path: The file.
         tick: Duration of a tick of the recording in seconds.
-        fps: Mean frame rate of the whole recording, for a common header of all segments.
+        fps: Mean frame rate of the whole recording, so that all segments have an equal header.
         coding: One of ``CODINGS``.
-        transfer: Transfer function of the camera, by which 10-bit codes are encoded.
+        transfer: Transfer function of the camera, with which 10-bit pictures are encoded.
 
     Raises:
         SinkError: The encoder is missing.
@@ -126,10 +128,14 @@ def join_parts(
 
 
 def _common_scale(tick: fractions.Fraction, source: Any) -> int:
-    """Return the time units per second in which every stream's start is an integer.
+    """Return a number of time units per second such that the start of every stream is a whole number of units.
 
-    If a stream does not begin at 0, an edit list states its start in this unit; MP4's usual milliseconds would round
-    it.
+    If a stream does not begin at 0, an edit list states its start in this unit. MP4's usual unit, the millisecond,
+    would round it.
+
+    Args:
+        tick: Duration of a tick of the video in seconds.
+        source: Container of the recording with the sound, or None.
     """
     ticks = [tick, *(stream.time_base for stream in source.streams.audio if stream.time_base)] if source else [tick]
     scale = math.lcm(*(fractions.Fraction(unit).denominator for unit in ticks))
@@ -139,7 +145,18 @@ def _common_scale(tick: fractions.Fraction, source: Any) -> int:
 def _video_packets(
     parts: Sequence[Path], starts: Sequence[int], tick: fractions.Fraction, header: bytes, zero: int
 ) -> Iterator[tuple[float, Any]]:
-    """Yield packets of all segments, with their time stamps in the file, in ticks."""
+    """Yield the packets of all segments, each with its time in the joined file, in seconds.
+
+    Args:
+        parts: Videos of the segments, in order.
+        starts: Time stamp in the recording of each segment's first frame, in ticks.
+        tick: Duration of a tick in seconds.
+        header: Header of the encoder, which must be equal in all segments.
+        zero: Time stamp in ticks that becomes 0 in the file.
+
+    Raises:
+        SourceError: A segment was encoded differently or has wrong time stamps.
+    """
     for path, start in zip(parts, starts, strict=True):
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
@@ -161,7 +178,14 @@ def _video_packets(
 
 
 def _sound(source: Any, target: Any, zero: float, until: float | None) -> Iterator[tuple[float, Any]]:
-    """Yield a recording's encoded sound packets, with their times in the file, in seconds."""
+    """Add a recording's sound streams to a file, and yield their packets, each with its time in the file in seconds.
+
+    Args:
+        source: Container of the recording.
+        target: Container of the joined file.
+        zero: Time in seconds of the recording that becomes 0 in the file.
+        until: Time in seconds of the recording at which the sound ends; None: at its own end.
+    """
     streams = {}
     for stream in source.streams.audio:
         made = target.add_stream_from_template(stream)

@@ -1,4 +1,4 @@
-"""Jobs of a worker, in a process or an actor: reads and writes files, and returns a record."""
+"""Worker of a run: does jobs that read and write files, and returns a record of each."""
 
 from __future__ import annotations
 
@@ -45,24 +45,25 @@ from warp_ar.scene import SourceSpec, dumps_scene
 PART = "frames.mp4"
 """File with a segment's frames."""
 DIGESTS = ".sha256"
-"""Ending of the file of picture digests, with one hexadecimal digest per line."""
+"""Suffix of the file of pictures' digests, with one hexadecimal digest per line."""
 
 LEAST_FREE = 1 << 20
-"""Free bytes below which a disk counts as full, whichever error a library reports."""
+"""Number of free bytes below which the disk counts as full, because some libraries report a full disk as another
+error."""
 
 
 class Work(Closing):
-    """Does jobs one after another; each worker has one."""
+    """Worker that does jobs one after another."""
 
     def __init__(self, context: Context) -> None:
-        """Set the numbers of threads; no job is begun."""
-        cv2.setNumThreads(1)  # with more threads, finding a marker takes more processor time but no less time
+        """Limit the threads of OpenCV and BLAS; no job is begun."""
+        cv2.setNumThreads(1)  # more threads do not find a marker sooner, but take more processor time
         threadpoolctl.threadpool_limits(1)  # results of BLAS depend on the number of threads
         self.context = context
         self._lighter = Lighter(context.jobs, context.folder, context.device)
 
     def close(self) -> None:
-        """End the threads."""
+        """Close the pipelines."""
         self._lighter.close()
 
     def version(self) -> str:
@@ -70,11 +71,11 @@ class Work(Closing):
         return program_version()
 
     def do(self, job: Job, arguments: Any = None) -> Outcome:
-        """Do a whole job; errors are returned, not raised.
+        """Do a job; an error is returned in the outcome, not raised.
 
         Args:
             job: The job.
-            arguments: Further data of some jobs: the folders of finished variations.
+            arguments: For a job of kind ``index``, the folders of the finished variations.
         """
         context = self.context
         key, start = job.key(context.jobs), time.perf_counter()
@@ -153,7 +154,7 @@ class Work(Closing):
         base = dataclasses.replace(base, camera=base.camera.scaled_to(*survey.size), source=None)
         poses = [pose for pose in map(survey.pose, range(job.first, job.end, dataset.every)) if pose is not None]
         drawn = draw_variation(base, dataset, job.clip, job.number, poses)
-        # Without the path of the captured light, which lies in the run's folder and not in the data set.
+        # The written scene does not name the survey's light, which is in the run's folder and not in the data set.
         path, fps = source_of(jobs, job.clip)
         own = scene_of(jobs, job.clip).captured
         shown = dataclasses.replace(drawn.scene, source=SourceSpec(path=path, fps=fps), captured=own)
@@ -193,7 +194,7 @@ class Work(Closing):
 
 
 def digest_of(picture: npt.NDArray[Any]) -> str:
-    """Return SHA-256 of a picture's bytes, row by row, in hexadecimal; other threads run meanwhile."""
+    """Return the SHA-256 digest of a picture's bytes, row by row, in hexadecimal."""
     return hashlib.sha256(np.ascontiguousarray(picture).data).hexdigest()
 
 
@@ -211,7 +212,13 @@ def _replace_models(part: Path, place: Path) -> None:
 
 
 def _note(log: Path, line: str, more: str = "") -> None:
-    """Append to a job's log; if the disk is full, the line is lost, but the job goes on."""
+    """Append a line to a job's log; if this fails, for example on a full disk, the job goes on without the line.
+
+    Args:
+        log: The file.
+        line: The line, before which date and time are written.
+        more: Further text after the line.
+    """
     try:
         with open(log, "a", encoding="utf-8") as stream:
             stream.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n{more}")
