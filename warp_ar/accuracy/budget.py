@@ -1,12 +1,14 @@
 """``--quality auto``: the methods of least error within a time budget, adapted to the load.
 
-**Costs.** Errors are those of the package's cost table. Costs depend on device and scene, so they are measured
-(``warp_ar.accuracy.costs``) on the first frame that shows the marker.
+**Errors** of methods are those of the package's cost table.
 
-**Choice.** ``warp_ar.accuracy.controller`` chooses the settings from measured frame times.
+**Costs** depend on device and scene, so they are measured on the first frame that shows the marker
+(``warp_ar.accuracy.costs``).
 
-**Switching.** Each set of methods has its own pipeline (``warp_ar.engine.switcher``), which lights the next frame when
-it is built and its kernels are loaded.
+**Choice.** ``warp_ar.accuracy.controller`` chooses a method for each setting from measured frame times.
+
+**Switching.** Each set of methods has its own pipeline (``warp_ar.engine.switcher``). It lights frames once it is built
+and its kernels are loaded.
 """
 
 from __future__ import annotations
@@ -45,6 +47,7 @@ from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 from warp_ar.stages.request import Estimates
 
 _KEPT_PIPELINES = 6
+"""Largest number of pipelines that are kept, the running one included."""
 
 
 class AutoPipeline(Closing):
@@ -72,12 +75,13 @@ class AutoPipeline(Closing):
             budget_ms: Milliseconds per frame, the marker's tracking included.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             size: Width and height of the frames; None means the scene's.
-            outputs: Parts of the results, as for ``Pipeline``.
+            outputs: Names of the outputs of ``Pipeline``.
             exposures: Exposure times in seconds between which the frames alternate.
             shown: Exposure time in seconds of the frames that are shown; None means the longest.
-            estimates: Frame in which an estimate takes effect: ``synchronous``, ``delayed`` or ``real_time``.
-            costs: Known costs; None: they are read from the cache or measured.
-            folder: Folder in which costs are kept; None means the user's cache folder.
+            estimates: Frame in which light estimated from a frame takes effect: ``synchronous``, ``delayed`` or
+                ``real_time``.
+            costs: Known costs; None: they are read from the cache, or measured.
+            folder: Folder in which costs are stored; None means the user's cache folder.
             clock: Clock in seconds.
 
         Raises:
@@ -103,16 +107,21 @@ class AutoPipeline(Closing):
         self._told = False
 
     def warm_up(self, progress: Progress | None = None) -> None:
-        """Load kernels as ``Pipeline.warm_up`` does, for the first frame's settings."""
+        """Load the kernels of the base quality, with which the first frame is lit.
+
+        Args:
+            progress: Function to which the numbers of compiled modules, first 0, and of all modules to compile are
+                passed.
+        """
         self.pipeline.warm_up(progress)
 
     def close(self) -> None:
-        """Stop the threads. Arrays are freed with the last result that refers to them."""
+        """Stop the threads. Arrays are freed once no result refers to them."""
         self._switcher.close()
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the pipeline that lights the next frame: its plan, quality, arrays or device."""
-        if name == "pipeline":  # not built yet
+        if name == "pipeline":  # the constructor has not built it yet
             raise AttributeError(name)
         return getattr(self.pipeline, name)
 
@@ -143,10 +152,10 @@ class AutoPipeline(Closing):
         return result
 
     submit = __call__
-    """Same as a call: a frame's time must be known before the next one, so frames are not sent ahead."""
+    """Light one frame and wait for it, because its time must be known before the next frame."""
 
     def _start(self, image: Any, pose: Pose | None) -> Controller:
-        """Read or measure the costs; return a controller that waits for frames that measure the load."""
+        """Read or measure the costs, and return a controller that keeps the base settings until the load is known."""
         if self._costs is None and self.settings:
             key = cost_key(self.plan, self.device, self.settings)
             self._costs = read_costs(self._folder, key, self.settings)
@@ -168,7 +177,7 @@ class AutoPipeline(Closing):
             self._changes.append(self._record())
 
     def _record(self) -> dict[str, Any]:
-        """Return a record of the controller's settings for the next frame."""
+        """Return a record of the controller's settings, with the number of frames so far."""
         assert self._controller is not None
         return {
             "frame": self._frames,
@@ -178,7 +187,7 @@ class AutoPipeline(Closing):
         }
 
     def _swap(self) -> None:
-        """Switch to the requested pipeline if it is ready; if it cannot be built, report it and choose others."""
+        """Switch to the requested pipeline if it is ready; if it cannot be built, say so and choose other methods."""
         controller = self._controller
         if controller is None:
             return
@@ -196,7 +205,7 @@ class AutoPipeline(Closing):
             controller.shown(self._clock())
 
     def _admit(self, _pipeline: Pipeline, _timing: Any) -> bool:
-        """Accept a newly built pipeline for the next frame."""
+        """Record and accept a newly built pipeline for the next frame."""
         self._changes.append(self._record())
         return True
 
@@ -209,7 +218,7 @@ class AutoPipeline(Closing):
             say(f"{self.budget_ms:g} ms cannot be kept: {least}")
 
     def status(self) -> dict[str, Any]:
-        """Return the choice, its expected cost and error, and every change, as plain data."""
+        """Return the chosen methods, their expected cost and error, and every change so far, as data for JSON."""
         controller = self._controller
         if controller is None:
             return {"budget_ms": self.budget_ms, "changes": []}

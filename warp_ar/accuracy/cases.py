@@ -1,4 +1,7 @@
-"""Cases: frames of a scene with their poses, and pictures of the truth if there are any."""
+"""Cases: frames of a scene with their poses, and pictures of the truth if there are any.
+
+The truth is the picture that the camera would have taken if virtual objects and lights were real.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,12 @@ from warp_ar.tracking.tracking import Tracker
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 LIGHT_RADIUS = 0.02
-"""Radius in metres of the lights of ``sized_light``: a light bulb."""
+"""Radius in metres of the lights of ``sized_light``: that of a light bulb."""
 SIZED = ", sized light"
 """Suffix of the names of cases made by ``sized_light``."""
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
-"""Kinds of true pictures of a case; ``object`` and ``light`` are used only if the case has no ``both``."""
+"""Kinds of true pictures of a case: with virtual object and light, with one of them, or with a shorter exposure.
+``object`` and ``light`` are used only if the case has no ``both``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,22 +40,27 @@ class Case:
     """Frames of a scene, with pictures of how they should look."""
 
     name: str
+    """Name for tables."""
     scene: Scene
+    """Scene at the size of the frames."""
     frames: tuple[Frame, ...]
+    """Frames of the clip."""
     poses: tuple[Pose | None, ...]
+    """``camera_from_world`` of each frame; None if lost or not needed."""
     truth: Mapping[int, Image]
     """Pictures that the camera would have taken, by frame; empty if the truth is unknown."""
     regions: Mapping[int, Mask] = dataclasses.field(default_factory=dict)
-    """Pixels that virtual content changes or that clip, by frame, if the truth states them."""
+    """Mask by frame of the pixels that virtual content changes, or of the clipped ones if the scene only changes the
+    exposure; empty if the truth is unknown."""
 
     @property
     def darker(self) -> bool:
-        """Return True if only clipped pixels matter: at another exposure all others are scaled, up to rounding."""
+        """True if the scene only shortens the exposure. Then only clipped pixels are compared; others are scaled."""
         return is_darker(self.scene)
 
     @property
     def shown(self) -> tuple[int, ...]:
-        """Frames whose pictures are compared."""
+        """Indices of the frames whose pictures are compared."""
         return tuple(self.truth) or (len(self.frames) - 1,)
 
 
@@ -90,7 +99,7 @@ def load_case(
         name: Name for tables.
         scene: Scene whose clip is read.
         count: Largest number of frames.
-        truth: Pictures by the frame's index in the clip: RGB, or RGBA that is transparent where nothing changes.
+        truth: True pictures by the frame's index in the clip: RGB, or RGBA that is transparent where nothing changes.
         times: Integer factor by which all pictures are reduced.
         first: Index of the first frame.
 
@@ -129,24 +138,30 @@ def smaller(case: Case, times: int) -> Case:
 
 
 def _complete(scene: Scene, camera: Image, truth: Image) -> tuple[Image, Mask]:
-    """Return the complete picture of the truth, and the region in which the truth differs from the frame."""
+    """Return the complete true picture of a frame, and the region in which it is compared.
+
+    Args:
+        scene: Scene of the case.
+        camera: The frame, RGB.
+        truth: The true picture, RGB, or RGBA that is transparent where nothing changes.
+    """
     scale = scene.exposure.scale
     if truth.shape[2] == 3:
         return truth, clipped_region(camera) if is_darker(scene) else changed_region(camera, truth)
-    # In transparent pixels only the exposure changes, and nothing clips.
+    # In transparent pixels only the exposure changes, and no channel clips.
     rest = camera if isinstance(scale, str) else scale_codes(camera, scale, scene.camera.transfer)
     region = truth[..., 3] > 0
     return np.where(region[..., None], truth[..., :3], rest), region
 
 
 def is_darker(scene: Scene) -> bool:
-    """Return True if a scene only changes the picture by a shorter exposure."""
+    """Return True if a scene changes the picture only by a shorter exposure."""
     scale = scene.exposure.scale
     return not isinstance(scale, str) and scale < 1.0 and not scene.objects and not scene.lights
 
 
 def scale_codes(image: Image, scale: float, transfer: str | Path) -> Image:
-    """Return a frame at another exposure, valid in unclipped pixels."""
+    """Return a frame at ``scale`` times its exposure; the result is valid in unclipped pixels."""
     values = decode_table(transfer)
     codes = np.arange(256)
     tables = [np.interp(column * scale, column, codes) + 0.5 for column in values.T]
@@ -159,7 +174,7 @@ def read_truth(folder: Path) -> dict[int, Image]:
 
 
 def truth_of(scene_file: Path) -> Path | None:
-    """Return the folder of pictures of a case's scene file: ``both`` for ``scene_both.toml``."""
+    """Return the folder of true pictures of a scene file, such as ``both`` for ``scene_both.toml``; else None."""
     folder = scene_file.parent / scene_file.stem.removeprefix("scene_")
     return folder if scene_file.stem.startswith("scene_") and folder.is_dir() else None
 
@@ -167,7 +182,7 @@ def truth_of(scene_file: Path) -> Path | None:
 def open_scene(name: str, count: int, times: int = 1) -> Case:
     """Return a case from a scene file or a bundled scene, with its truth.
 
-    A bundled scene has one frame of truth, ``truth/SCENE_NNNN.png``; the case ends with that frame.
+    A bundled scene has at most one true picture, ``truth/SCENE_NNNN.png``; the case ends with frame NNNN.
 
     Args:
         name: Name of a bundled scene, or a scene file.

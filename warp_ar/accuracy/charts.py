@@ -30,11 +30,12 @@ _FONT = 9.0
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """Choice in a chart."""
+    """Point of a chart: a measured method or quality."""
 
     label: str
     milliseconds: float
     error: float
+    """Error in FLIP."""
     dominated: bool
     """True if another point costs no more and has no larger error."""
 
@@ -58,13 +59,13 @@ def scatter(
     limit: float | None = None,
     size: tuple[float, float] = SIZE,
 ) -> str:
-    """Return a chart of logarithmic cost and error; Pareto-optimal points are filled and joined by a line.
+    """Return a chart, as SVG, of error over the logarithm of cost; a line joins the Pareto-optimal points.
 
     Args:
-        points: Measured choices.
+        points: Measured methods or qualities.
         x_title: Name of the cost.
         y_title: Name of the error.
-        limit: Cost in milliseconds to mark, such as that of 30 frames per second.
+        limit: Cost in milliseconds of 30 frames per second, to mark it; None: it is not marked.
         size: Width and height in inches of 100 pixels.
     """
     drawing, axes = _axes(x_title, y_title, size)
@@ -89,7 +90,7 @@ def scatter(
     for number, (cost, point) in enumerate(zip(costs, points, strict=True)):
         face, edge = ("card", "other") if point.dominated else ("mark", "mark")
         axes.plot(cost, point.error, "o", markersize=7, markerfacecolor=_COLORS[face], markeredgecolor=_COLORS[edge])
-        # Names of neighbouring points alternate between above and below.
+        # Labels of neighbouring points alternate between above and below.
         below = bool(number % 2) and point.error > 0.2 * axes.get_ylim()[1]
         style = {"color": _COLORS["soft" if point.dominated else "ink"], "fontsize": _FONT, "ha": "center"}
         offset = (0, -15 if below else 8)
@@ -99,7 +100,7 @@ def scatter(
 
 
 def lines(series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]], x_title: str, y_title: str) -> str:
-    """Return a chart of several curves, each given by name, x and y, with a legend."""
+    """Return a chart, as SVG, of several curves, each given by name, x and y, with a legend."""
     drawing, axes = _axes(x_title, y_title, SIZE)
     looks = itertools.cycle(
         itertools.product(("-", "--", ":"), (_COLORS[name] for name in ("ink", "mark", "warm", "other")))
@@ -129,7 +130,7 @@ def _axes(x_title: str, y_title: str, size: tuple[float, float]) -> tuple[Any, A
 
 
 def _to_svg(drawing: Any, title: str, description: str) -> str:
-    """Return a figure as SVG, for a file or a page; text stays text, and ids are unique."""
+    """Return a figure as SVG for a file or a page; its text is not converted to outlines, and its ids are unique."""
     import matplotlib
 
     file = io.StringIO()

@@ -1,10 +1,11 @@
 """Controller of ``--quality auto`` and of the page's budget: chooses settings from measured frame times.
 
-The predicted time of a frame is the cost of its settings times the load. Frames are evaluated in windows, by their
-median; a window far above the budget is cut short. Above the budget, settings are chosen anew with the measured load,
-to use ``AIM`` of the budget. Below ``LEAST`` of the budget, settings with a smaller error are chosen if they fit into
-``AIM``. In between nothing changes. This hysteresis is wider than the noise of a window's median, so that noise causes
-no change.
+The predicted time of a frame is the cost of its settings times the load. The load, the ratio of measured to predicted
+time, is measured over windows of frames, by the median of their times. A window far above the budget is cut short. If
+the median is above the budget, settings are chosen anew with the measured load, for a predicted time of at most ``AIM``
+times the budget. If it is below ``LEAST`` times the budget, settings with a smaller error are chosen if their predicted
+time is at most ``AIM`` times the budget. In between nothing changes. This hysteresis is wider than the noise of a
+window's median, so that noise causes no change.
 
 Predicted costs may be too low. If frames exceed the budget right after more expensive settings were applied, those
 settings are taken to be the cause, not the load. Settings of that cost are not tried again for some time, which doubles
@@ -25,14 +26,15 @@ AIM = 0.92
 LEAST = 0.82
 """Share of the budget below which settings with a smaller error are searched for."""
 FIRST_WINDOW, WINDOW, LONGEST_WINDOW = 27, 81, 324
-"""Frames of the first window, of the first after a change, and of the longest; each window without a change is twice as
-long as the last. If frames scatter by a fifth, their medians are known to 5, 3 and 1.4 %."""
+"""Number of frames of the very first window, of the first window after a change, and of the longest window. Without a
+change, each window is twice as long as the last. If the times of frames scatter by a fifth, the medians have errors of
+5, 3 and 1.4 %."""
 HASTE_FRAMES, HASTE = 9, 1.3
-"""Least number of frames of a window that is cut short, and the ratio of its median to the budget from which it is."""
+"""Number of latest frames, and the ratio of their median to the budget above which a window is cut short to them."""
 HELD_SECONDS = 0.5
-"""Least time for which settings are kept."""
+"""Least time in seconds for which settings are kept."""
 SETTLE = 2
-"""Frames after a change that are ignored."""
+"""Number of frames after a change that are not measured."""
 MEMORY = 60.0
 """Seconds for which settings that exceeded the budget are not tried again; doubled at each repetition."""
 MOST_DOUBLINGS = 6
@@ -40,7 +42,7 @@ MOST_DOUBLINGS = 6
 
 
 class Controller:
-    """Chooses settings for a budget, and changes them by measured frame times."""
+    """Controller that chooses settings for a budget, and changes them according to measured frame times."""
 
     def __init__(
         self,
@@ -49,7 +51,7 @@ class Controller:
         budget_ms: float,
         running: Mapping[str, str] | None = None,
     ) -> None:
-        """Choose settings by the costs, or wait for frames that measure the load.
+        """Choose settings by the costs, or keep the running ones until the load is measured.
 
         Args:
             costs: Costs on this device and scene.
@@ -65,15 +67,16 @@ class Controller:
         self._skip = SETTLE
         self._held_since = -math.inf
         self._entry_factor: float | None = None
-        """Load when the current, more accurate settings were chosen; None after a window has measured their time."""
+        """Load at the time when more expensive settings were chosen; None once a window has measured their time."""
         self._ceiling, self._until, self._failures = math.inf, 0.0, 0
-        """Milliseconds from which settings are not tried until a given time, and the number of such failures."""
+        """Predicted milliseconds above which settings are not chosen; the time until which this applies; and the number
+        of times that such settings have exceeded the budget."""
         self._never = math.inf
-        """Milliseconds from which settings cannot be built."""
+        """Predicted milliseconds from which settings are never chosen, because they could not be built."""
         self.chosen = running is None
         """True if the first choice has been made."""
         self.fits = True
-        """False if frames exceed the budget and no known settings are cheaper."""
+        """False if frames exceed the budget although no settings are cheaper."""
         self.measured_ms: float | None = None
         """Median of the last window, milliseconds."""
         self.settings: dict[str, str] = dict(self._best().settings if running is None else running)
@@ -82,7 +85,7 @@ class Controller:
 
     @property
     def choices(self) -> list[Choice]:
-        """All Pareto-optimal choices, cheapest first; milliseconds are relative to the base, as in the costs."""
+        """All Pareto-optimal choices, cheapest first; their milliseconds are relative to the base of the costs."""
         return self._front
 
     @property
@@ -97,7 +100,7 @@ class Controller:
 
     @property
     def expected_error(self) -> float:
-        """FLIP in excess of the best methods' that the cost table gives for the current settings."""
+        """Expected error of the current settings by the cost table: FLIP in excess of that of the best methods."""
         return self._error(self.settings)
 
     def _error(self, settings: Mapping[str, str]) -> float:
@@ -108,20 +111,20 @@ class Controller:
         return max(self._costs.base + self._costs.excess(settings), 1e-3)
 
     def _best(self) -> Choice:
-        """Return the choice of least error within the aim and below the ceiling; the cheapest if none fits."""
+        """Return the choice of least error within ``AIM`` times the budget that may be tried; else the cheapest."""
         limit = min(AIM * self.budget_ms / self.factor, self._ceiling) - self._costs.base
         never = self._never - self._costs.base
         fitting = [choice for choice in self._front if choice.milliseconds <= limit and choice.milliseconds < never]
         return fitting[-1] if fitting else self._front[0]  # errors decrease along the Pareto front
 
     def set_budget(self, budget_ms: float) -> None:
-        """Choose settings for another budget, with the same load."""
+        """Choose settings for another budget, with the load that is known."""
         self.budget_ms, self._ceiling, self._entry_factor = budget_ms, math.inf, None
         self.settings = dict(self._best().settings)
         self.restart()
 
     def restart(self) -> None:
-        """Discard measured frames, if they do not represent the next ones."""
+        """Discard the times of frames so far, because they do not represent the next ones."""
         self._times.clear()
         self._skip, self._window = SETTLE, WINDOW
 
@@ -131,14 +134,17 @@ class Controller:
         self.restart()
 
     def reject(self) -> None:
-        """Choose cheaper settings because the current ones cannot be built: half-way back to those in use."""
+        """Choose cheaper settings because the current ones cannot be built.
+
+        Their predicted time must be below the mean of that of the current settings and of those in use.
+        """
         lit, cost = self._cost(self._lit), self._cost(self.settings)
         self._never, self._entry_factor = (0.5 * (lit + cost) if cost > 1.01 * lit else lit), None
         self.settings = dict(self._best().settings) if self._never > lit else dict(self._lit)
         self.restart()
 
     def observe(self, milliseconds: float, now: float) -> bool:
-        """Take the time of a frame.
+        """Evaluate the time of a frame, and choose other settings if a window is complete and calls for it.
 
         Args:
             milliseconds: Time of the whole frame.
@@ -179,7 +185,13 @@ class Controller:
         return True
 
     def _tell_apart(self, measured: float, now: float, *, over: bool) -> None:
-        """Attribute the measured time to the load, or to settings that were just applied."""
+        """Attribute the measured time to the load, or to the cost of settings that were just applied.
+
+        Args:
+            measured: Median of the window, milliseconds.
+            now: Seconds on a monotonic clock.
+            over: True if the median exceeds the budget.
+        """
         entry, self._entry_factor = self._entry_factor, None
         cost = self._cost(self.settings)
         if not over or entry is None:

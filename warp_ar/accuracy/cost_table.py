@@ -1,12 +1,12 @@
 """Settings of a quality, the cost and the error of their methods, and the choice for a budget.
 
 A **setting** is a stage with several methods, or a number or method of ``Quality`` that several stages share. The
-**cost** of a method is its time in milliseconds, and its error is in FLIP. Both are assumed to be additive: costs
-because stages run one after another, errors because each is the excess over the setting's best method, averaged over
-the same pixels.
+**cost** of a method is its time in milliseconds. Its **error** is in FLIP, in excess of the setting's best method. A
+**choice** is one method for each setting. Costs and errors of a choice are assumed to be sums over its methods: costs
+because stages run one after another, errors because all are averaged over the same pixels.
 
-The choice is a small knapsack problem with one item per setting, solved exactly: settings are joined one by one, and
-joined choices that are dominated in cost and error are dropped.
+The choice of least error within a budget is a multiple-choice knapsack problem, solved exactly: settings are added one
+by one, and partial choices that are dominated in cost and error are dropped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.request import Request
 
 COST_TABLE = "cost_table.json"
-"""File of the committed errors, next to this module."""
+"""File with the errors of all methods, next to this module."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,13 +39,13 @@ class Setting:
     name: str
     """Name of a stage, or of a field of ``Quality``."""
     methods: tuple[str, ...]
-    """Methods, cheapest first; the last is the reference."""
+    """Methods, cheapest first; the last is the most accurate."""
     stages: tuple[str, ...]
-    """Stages whose work it changes."""
+    """Names of the stages whose work the setting changes."""
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Methods that a budget may choose: all but brute force."""
+        """Methods that may be chosen for a budget: all but brute force."""
         return tuple(method for method in self.methods if method != "brute_force")
 
     @property
@@ -55,7 +55,7 @@ class Setting:
 
 
 def _shared(name: str, *methods: str) -> Setting:
-    """Return a setting that several stages share, with the stages that declare it."""
+    """Return a setting that several stages share; its stages are those that declare it."""
     return Setting(name, methods, tuple(stage.name for stage in STAGES if name in stage.settings))
 
 
@@ -99,11 +99,11 @@ _LIGHT_ONLY = {stage.name: stage.unseen_method for stage in STAGES if stage.unse
     "light_shadow": "hard",
     "area_light": "point",
 }
-"""Methods of stages without effect on the light, for frames that are not shown."""
+"""Cheap methods of settings that do not affect the captured light, for frames that are not shown."""
 
 
 def chosen(quality: Quality, setting: Setting) -> str:
-    """Return the method of a setting in ``quality``; if it is not named, the stage's default, the last."""
+    """Return the method of a setting in a quality; if the quality names none, the default, which is the last method."""
     if setting.name in NUMBERS:
         return str(getattr(quality, setting.name))
     method = quality.method(setting.name)
@@ -111,7 +111,11 @@ def chosen(quality: Quality, setting: Setting) -> str:
 
 
 def turn(quality: Quality, settings: Mapping[str, str]) -> Quality:
-    """Return ``quality`` with other methods for some settings.
+    """Return a quality with other methods for some settings.
+
+    Args:
+        quality: The quality.
+        settings: Methods by the names of their settings.
 
     Raises:
         UsageError: A setting or a method is unknown.
@@ -132,7 +136,7 @@ def turn(quality: Quality, settings: Mapping[str, str]) -> Quality:
 
 
 def light_only(quality: Quality) -> Quality:
-    """Return the quality with the same light, but cheap methods for the picture, for frames that are not shown."""
+    """Return a quality that captures light as the given one, but has cheap methods for the rest of the picture."""
     return turn(quality, _LIGHT_ONLY)
 
 
@@ -151,20 +155,22 @@ def relevant_settings(scene: Scene, size: tuple[int, int]) -> tuple[Setting, ...
 
 @dataclasses.dataclass(frozen=True)
 class MethodCost:
-    """One method of one setting."""
+    """Cost and error of one method of one setting."""
 
     setting: str
     method: str
     milliseconds: float
+    """Milliseconds per frame in excess of the base quality's."""
     error: float
-    """Error in FLIP, as the cost table defines it."""
+    """Error in FLIP, in excess of the setting's best method."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """A method for every setting, with their total cost and error."""
+    """Choice of a method for every setting, with their total cost and error."""
 
     settings: tuple[tuple[str, str], ...]
+    """Pairs (setting, method)."""
     milliseconds: float
     error: float
 
@@ -211,14 +217,19 @@ def load_errors() -> dict[str, dict[str, float]]:
 
 
 def load_presets(scene: str, value: str = "error") -> dict[str, float]:
-    """Return ``error`` or ``ms`` of each preset's whole frames: of the bundled scene, else the mean of all scenes."""
+    """Return a measured value of each preset's whole frames, from the package's cost table.
+
+    Args:
+        scene: Name of a bundled scene; for another name, the mean over all scenes is returned.
+        value: ``error`` (FLIP) or ``ms``.
+    """
     presets = [own for own in _load_table()["presets"].values() if all(value in one for one in own.values())]
     found = [own for own in presets if own is _load_table()["presets"].get(scene)] or presets
     return {name: sum(own[name][value] for own in found) / len(found) for name in found[0]}
 
 
 def read_errors(cost_table: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return the errors of a cost table; a method without an entry has the error of the next cheaper one.
+    """Return the errors in a cost table by setting and method; a method without an entry has that of the one before it.
 
     Raises:
         UsageError: The table has no errors, or one that is not a number.

@@ -1,6 +1,6 @@
-"""Costs of all methods on this device, measured on one frame and kept in the user's cache folder.
+"""Costs of all methods on this device, measured on one frame and stored in the user's cache folder.
 
-Costs depend on the device and on the scene. They are measured by varying one setting at a time from a base preset.
+Costs depend on the device and on the scene. In the measurement, one setting at a time differs from a base preset.
 """
 
 from __future__ import annotations
@@ -30,19 +30,23 @@ from warp_ar.stages.recover import EVERY_FRAME
 from warp_ar.tracking.tracking import Tracker
 
 BASE = PRESETS["medium"]
-"""Preset from which costs are measured, and which runs until settings are chosen."""
+"""Preset relative to which costs are measured, and which runs until settings are chosen."""
 MEASURED_FRAMES = 6
-"""Number of frames by which a method is timed."""
+"""Largest number of frames over which a method is timed."""
 _WARM_UP = 1
+"""Number of frames before a measurement."""
 NOW_AND_THEN = "recover"
-"""Stage that works some times a second on a separate thread; its cost is measured from the process's total work."""
+"""Name of the stage that runs only a few times per second, on a separate thread. Its cost is measured by the processor
+time of the whole process."""
 _SPREAD_FRAMES = 12
-"""Number of frames for that measurement, which contain two runs of the stage."""
+"""Number of frames over which the stage ``NOW_AND_THEN`` is measured; it runs twice in them."""
 _ENOUGH_MS = 200.0
-"""Total milliseconds after which a measurement ends: expensive methods use fewer frames, as their noise is small."""
+"""Total milliseconds after which a measurement ends. Expensive methods are timed over fewer frames, because their
+relative noise is small."""
 WORK = time.thread_time
 """Clock of a thread's processor time, on which other programs have little effect."""
 _CACHE_FILE = "costs.json"
+"""Name of the file with the costs of all devices and scenes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,12 +61,12 @@ class Costs:
     """Milliseconds of ``base`` that tracking takes."""
 
     def excess(self, settings: Mapping[str, str]) -> float:
-        """Return the expected milliseconds per frame of settings in excess of the base."""
+        """Return the expected milliseconds per frame of methods, by setting, in excess of the base."""
         return sum(self.methods[setting][method] for setting, method in settings.items())
 
 
 def make_method_costs(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[MethodCost]:
-    """Return a list that joins the device's costs with errors, by setting and method."""
+    """Return the costs on a device together with the errors, one entry per method of each setting."""
     return [
         MethodCost(setting, method, milliseconds, errors[setting][method])
         for setting, own in costs.methods.items()
@@ -75,7 +79,7 @@ def measure_costs(*arguments: Any, tell: Callable[[float], object] = lambda shar
 
     Args:
         arguments: Arguments of ``measure_steps``.
-        tell: Receives the completed share, 0 to 1, after each step.
+        tell: Function to which the completed share, 0 to 1, is passed after each step.
         options: Keyword arguments of ``measure_steps``.
     """
     steps = measure_steps(*arguments, **options)
@@ -97,7 +101,7 @@ def measure_steps(
     *,
     all_methods: bool = False,
 ) -> Generator[tuple[float, Costs | None], None, Costs]:
-    """Time methods on one repeated frame, in small steps; yield the completed share with the costs so far; return all.
+    """Time methods on one frame, which is lit repeatedly, in small steps.
 
     Args:
         scene: Scene that is shown.
@@ -106,9 +110,15 @@ def measure_steps(
         device: ``cpu`` or ``cuda:N``.
         size: Width and height.
         settings: Settings to vary.
-        clock: Clock in seconds, on CPU. None measures processor time, on which other programs have little effect,
-            scaled by the ratio of elapsed to processor time of the base.
-        all_methods: Whether to time brute force too.
+        clock: Clock in seconds, on CPU. None: processor time is measured, on which other programs have little effect.
+            It is scaled by the ratio of elapsed time to processor time of the base.
+        all_methods: True to time brute force too.
+
+    Yields:
+        The completed share, 0 to 1, with the costs so far, None after the first step.
+
+    Returns:
+        All costs.
     """
     methods = {setting: setting.methods if all_methods else setting.measured for setting in settings}
     count, done = sum(map(len, methods.values())) + 2, 2
@@ -133,7 +143,7 @@ def measure_steps(
                 times[method] = _time_stages(scene, image, pose, device, size, quality, timed, spread)
                 times[method].pop(TRACK, None)
             done += 1
-            # Stages that all methods of a setting share cost the same; measured differences between them are noise.
+            # Other stages than the setting's cost equally with all of its methods; measured differences are noise.
             common = set.intersection(*map(set, times.values())) - set(setting.stages)
             own = {one: sum(ms for name, ms in stages.items() if name not in common) for one, stages in times.items()}
             costs[setting.name] = {one: pace * (own[one] - own[start]) for one in names if one in own}
@@ -151,7 +161,10 @@ def _time_stages(
     clock: Callable[[], float],
     spread: bool = False,
 ) -> dict[str, float]:
-    """Return milliseconds by stage; with a clock of elapsed time also those of tracking."""
+    """Return the milliseconds of each stage at a quality; with a clock of elapsed time also those of tracking.
+
+    With ``spread``, only the cost of the stage ``NOW_AND_THEN`` is measured on CPU.
+    """
     times: dict[str, list[float]] = {}
     spent = 0.0
     warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, MEASURED_FRAMES)
@@ -184,7 +197,7 @@ def _time_stages(
 
 
 def show_again(pipeline: Pipeline, image: Any, pose: Pose | None, index: int) -> Result:
-    """Light a picture as the ``index``-th frame, slightly darker in every second one, so that every stage runs."""
+    """Light a picture as frame ``index``; it is darkened in every second frame, so that no stage is skipped."""
     pipeline.scheduler.forget()
     shown = image - image // 8 if index % 2 else image
     return pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
@@ -193,7 +206,7 @@ def show_again(pipeline: Pipeline, image: Any, pose: Pose | None, index: int) ->
 def open_profiled(
     scene: Scene, device: str, quality: Quality, size: tuple[int, int] | None, clock: Callable[[], float]
 ) -> Pipeline:
-    """Return a pipeline whose stages are timed by ``clock``; with ``WORK`` one thread runs them one after another."""
+    """Return a pipeline whose stages are timed by a clock; for the clock ``WORK``, one thread runs all stages."""
     bands = 1 if clock is WORK else None
     pipeline = Pipeline(scene, device=device, quality=quality, size=size, bands=bands, profile=True)
     pipeline.scheduler.clock = clock
@@ -201,7 +214,7 @@ def open_profiled(
 
 
 def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
-    """Return the milliseconds of the process's work: all of it with ``WORK``, else divided by the number of cores."""
+    """Return processor time of the process in milliseconds; for other clocks than ``WORK`` divided by all cores."""
     return seconds * 1e3 / (1 if clock is WORK else usable_cores())
 
 
@@ -224,7 +237,7 @@ def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
 
 
 def package_version() -> str:
-    """Return the version of this package; a checkout that is not installed has none."""
+    """Return the version of this package; ``checkout`` if it is not installed."""
     try:
         return importlib.metadata.version("warp-ar")
     except importlib.metadata.PackageNotFoundError:
@@ -232,7 +245,13 @@ def package_version() -> str:
 
 
 def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | None:
-    """Return the kept costs; None if there are none or they cannot be used."""
+    """Return stored costs; None if there are none or they cannot be used.
+
+    Args:
+        folder: Folder of the file.
+        key: Result of ``cost_key``.
+        settings: Settings that the costs must contain.
+    """
     try:
         kept = json.loads((folder / _CACHE_FILE).read_text(encoding="utf-8"))[key]
         methods = {
@@ -244,11 +263,11 @@ def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | N
         )
         return Costs(float(kept["base"]), methods, float(kept["track"])) if known else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None  # no file, or not of this program: costs are measured again
+        return None  # there is no file, or another program has written it: costs are measured again
 
 
 def write_costs(folder: Path, key: str, costs: Costs) -> None:
-    """Keep costs next to those of other devices and scenes; if they cannot be written, they are measured again."""
+    """Store costs with those of other devices and scenes; a failure is reported, and costs are measured again later."""
     path = folder / _CACHE_FILE
     try:
         everything = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""A frame of a scene with the pipeline's knowledge of it: pose, light, and lit picture."""
+"""Frame of a scene with the pose, the light and the picture that a pipeline found for it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class KnownFrame:
-    """A frame, with the pipeline's pose, light and picture."""
+    """Frame, with the pipeline's pose, light and picture."""
 
     scene: Scene
     """Scene with its camera scaled to the frame's size."""
@@ -40,11 +40,11 @@ class KnownFrame:
     light: Light
     """Light of the environment; emitters of known distance are in ``Light.emitters``."""
     seconds: float
-    """Time since the first frame."""
+    """Seconds since the first frame."""
     milliseconds: float
     """Total time of the frame's stages."""
     balls: int = 1
-    """Number of mirror balls between which the pipeline interpolates light; ``light`` is the first one's only."""
+    """Number of mirror balls between which the pipeline interpolates light; ``light`` is that at the first one."""
 
     def tracer(
         self,
@@ -70,7 +70,7 @@ class KnownFrame:
         )
 
     def placed(self, *, device: str = "auto") -> KnownFrame:
-        """Return this frame with estimated distances of its light's emitters, if none was known.
+        """Return this frame with estimated distances of its light's emitters, or unchanged if a distance was known.
 
         Raises:
             UsageError: The scene has no mirror ball, or the frame does not show a proxy sufficiently.
@@ -81,7 +81,7 @@ class KnownFrame:
 
 @functools.cache
 def _tell_first(scene: str, balls: int) -> None:
-    """Print once that a reference uses only the first ball's light."""
+    """Log once that a path-traced reference uses only the light at the first ball."""
     _LOG.warning(
         "%s: the path tracer's light is that of the first of %d mirror balls, everywhere; the pipeline's is "
         "interpolated between them, so the two differ away from the first",
@@ -98,7 +98,7 @@ def light_up_to(
     device: str = "auto",
     source: str | int | Path | None = None,
 ) -> KnownFrame:
-    """Light a scene's frames by a pipeline, up to one of them, and return that one.
+    """Light a scene's frames by a pipeline up to frame ``number``, and return that frame.
 
     Args:
         scene: Scene to light.
@@ -145,7 +145,14 @@ def light_up_to(
 
 
 def known_frame(pipeline: Pipeline, image: Image, result: Result, seconds: float) -> KnownFrame:
-    """Return the data that a path tracer needs of the frame that a pipeline has just lit."""
+    """Return the data that a path tracer needs of a frame.
+
+    Args:
+        pipeline: Pipeline that has just lit the frame.
+        image: The frame, uint8 RGB.
+        result: Result of the pipeline, with a pose.
+        seconds: Seconds since the first frame.
+    """
     assert result.pose is not None
     others = pipeline.plan.features.others
     with exclusive(pipeline.device):
@@ -155,7 +162,7 @@ def known_frame(pipeline: Pipeline, image: Image, result: Result, seconds: float
 
 
 def exposed_scene(pipeline: Pipeline) -> Scene:
-    """Return the pipeline's scene; an automatic exposure is replaced by that of the last frame."""
+    """Return the pipeline's scene, with an automatic exposure replaced by its value in the last frame."""
     scale = pipeline.arrays.get("expose_scale")
     if scale is None:
         return pipeline.scene
@@ -163,7 +170,7 @@ def exposed_scene(pipeline: Pipeline) -> Scene:
 
 
 def light_of(pipeline: Pipeline) -> Light:
-    """Return the pipeline's current light; black if the scene needs none."""
+    """Return the pipeline's light of the last frame; black if the scene needs none."""
     arrays = pipeline.arrays
     radiance: npt.NDArray[np.float32] = np.zeros((2, 4, 3), np.float32)
     if arrays.get("environment") is not None:
@@ -183,7 +190,13 @@ def _triple(values: npt.NDArray[np.float32]) -> tuple[float, float, float]:
 
 
 def _emitter(record: np.void, distance: float | None, height: int) -> CapturedEmitter:
-    """Return an emitter from the pipeline's record, with the solid angle of one texel."""
+    """Return an emitter with the solid angle of one texel.
+
+    Args:
+        record: The pipeline's record of the emitter.
+        distance: Its distance in metres; None if it is infinite.
+        height: Rows of the environment map.
+    """
     direction, origin, power = (_triple(record[name]) for name in ("direction", "origin", "power"))
     size = float(texel_solid_angles(height)[height // 2, 0])
     return CapturedEmitter(direction, size, power, power, None, distance, origin)

@@ -2,14 +2,14 @@
 
 Light from a file is measured at one point: it contains the direction of an emitter, not its distance. If a lamp half a
 metre away is treated as distant, it lights the whole desk evenly, with parallel shadows. The frame determines the
-distances: with the right ones, the desk's reflectance (radiance over irradiance) is constant except for texture. With
-wrong ones the estimated reflectance falls off across the desk and contains false shadows and false lights. So emitters
-are placed one after another, the most powerful first, at the distance with the least scatter of each proxy's
-reflectance:
+distances. With the right ones, the estimated reflectance of the desk (radiance divided by irradiance) is constant
+except for texture. With wrong ones it falls off across the desk and contains false shadows and false lights. Emitters
+are therefore placed one after another, the most powerful first, at the distance for which the reflectance of each proxy
+scatters least:
 
-    cost = mean over pixels of log(1 + (r / GRAIN)^2),    r = log(reflectance) - its median over the proxy,
+    cost = mean over pixels of log(1 + (r / GRAIN)^2),    r = log(reflectance) - its median over the proxy
 
-computed by the path tracer, which includes shadows, interreflection and balls. ``Light.save`` stores the result.
+The path tracer computes the irradiance, with shadows, interreflection and balls. ``Light.save`` stores the result.
 """
 
 from __future__ import annotations
@@ -31,27 +31,29 @@ WIDTH = 160
 SAMPLES = 16
 """Samples per pixel of the pictures in which reflectance is measured."""
 GRAIN = 0.1
-"""Deviation of the logarithm of reflectance beyond which it has less weight: about that of wood or paper."""
+"""Deviation of the logarithm of reflectance beyond which pixels have less weight: about that of wood or paper."""
 SHOWN = (0.01, 0.95)
-"""Range of radiance, in camera values, in which a pixel measures reflectance."""
+"""Range of linear radiance, 1 at clipping, in which a pixel measures reflectance."""
 LEAST_PIXELS = 50
-"""Least number of pixels of a proxy for an estimate."""
+"""Smallest number of a proxy's pixels for an estimate."""
 WORTH = 0.1
-"""Least relative decrease of the cost for a distance: grain and clutter resemble shadows by chance."""
+"""Smallest relative decrease of the cost for which a distance is accepted, because wood grain and clutter may resemble
+shadows by chance."""
 MOST = 3
 """Largest number of emitters with an estimated distance."""
 NEAREST, FARTHEST = 0.25, 2.0
-"""Least and largest trial distance, metres: nearer emitters would be visible, farther ones count as distant."""
+"""Smallest and largest tested distance, metres: nearer emitters would be visible, farther ones count as distant."""
 BOUND = 0.9 * FARTHEST
 """Largest accepted distance, metres. A minimum at the end of the search has other causes, such as paint that is darker
 on one side."""
 STEPS = 6
-"""Steps of the search between two trial distances."""
+"""Number of costs evaluated by the search between two tested distances."""
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+"""Golden ratio, 0.618."""
 
 
 def reflectance_scatter(tracer: PathTracer) -> float:
-    """Return the scatter of the estimated reflectance over each proxy: the cost of the module's docstring.
+    """Return the scatter of the estimated reflectance over each proxy, the cost that the module's docstring defines.
 
     Args:
         tracer: Path tracer of the frame, with the light to evaluate.
@@ -82,7 +84,7 @@ def place_emitters(
     device: str = "auto",
     seconds: float = 0.0,
 ) -> Light:
-    """Return the light with estimated distances of its emitters, as far as the frame determines them.
+    """Return a light with estimated distances of its emitters, where the frame determines them.
 
     Args:
         light: Light at the first mirror ball of the scene, in the world's axes; an image is latlong (h, 2 h, 3). A
@@ -124,14 +126,17 @@ def place_emitters(
 
 
 def _at(light: Light, number: int, distance: float) -> Light:
-    """Return the light with one emitter at a given distance."""
+    """Return a light with emitter ``number`` at a distance in metres."""
     emitters = list(light.emitters)
     emitters[number] = dataclasses.replace(emitters[number], distance=distance)
     return dataclasses.replace(light, emitters=tuple(emitters))
 
 
 def _placed(light: Light, number: int, cost: Callable[[Light], float]) -> tuple[Light, float]:
-    """Return the light with one emitter at the distance of least cost, and the cost; by a grid and golden sections."""
+    """Return a light with emitter ``number`` at the distance of least cost, and that cost.
+
+    The distance is searched on a grid, and then between the neighbours of the best one by golden sections.
+    """
     distances = sorted({NEAREST, FARTHEST, *CONFIG.search.distances})
     costs = [cost(_at(light, number, distance)) for distance in distances]
     best = int(np.argmin(costs))

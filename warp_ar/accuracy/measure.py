@@ -1,15 +1,17 @@
 """Measurement of cases: all methods of all settings, presets, and our choices at the paper's time and at its error.
 
-**Error of a method.** If all methods approximate the last one's result (``converges``), it is the distance from that
-result: a method that is closer to the truth than the exact solution is so by chance, because another stage is
-inaccurate. If methods are different models, it is the distance from the truth minus that of the best method. Distances
-are FLIP, summed over the picture and divided by the number of pixels that virtual content changes, so that the errors
-of all settings have one scale.
+**Error of a method.** Distances between pictures are FLIP, summed over the picture and divided by the number of pixels
+that virtual content changes, so that the errors of all settings have one scale. If all methods of a setting approximate
+the last one's result (``converges``), the error is the distance from that result. A method that is closer to the truth
+than the exact solution is so by chance, because another stage is inaccurate. If methods are different models, the error
+is the distance from the truth minus that of the best method.
 
-**Cost of a method** is the time of its stages in excess of the setting's cheapest method, measured as by ``--quality
-auto``. The command measures methods at half the size of the frames, because exact ones take minutes a frame. Presets,
-and the choices of the cost table at the paper's time and error, are timed as whole frames, one frame of each in turn.
-Choices are based on the committed errors, not on the errors of the measured case.
+**Cost of a method.** It is the time of its stages in excess of the setting's cheapest method, measured by
+``measure_costs``. The command measures methods at half the size of the frames, because exact ones take minutes a frame.
+
+**Whole frames.** Presets are timed as whole frames, one frame of each in turn. So are two choices of the cost table:
+the best at the time of the paper's methods, and the cheapest at their error. These choices are based on the errors in
+the package's cost table, not on those of the measured case.
 """
 
 from __future__ import annotations
@@ -42,28 +44,29 @@ from warp_ar.stages.quality import PRESETS, Quality
 Clock = Callable[[], float]
 Label = TypeVar("Label", bound=Hashable)
 Tell = Callable[[str], object]
-"""Function that receives a description of each finished step."""
+"""Function to which a description of each step is passed."""
 BASE = PRESETS["high"]
 """Preset of all settings except the varied one."""
 WARM_UP = 3
-"""Frames of a run that are not timed, because modules are loaded and caches filled."""
+"""Number of first frames of a run that are not timed, because they load modules and fill caches."""
 RUNS = ("paper", "low", "medium", "high")
 """Presets to measure as a whole."""
 SAME_TIME, SAME_ERROR = "ours near the paper's time", "ours near the paper's error"
-"""Names of the choices of the cost table; their time and error are measured together with the presets'."""
+"""Names of the two choices of the cost table, which are measured together with the presets."""
 COST_NOISE, FLIP_NOISE = 0.03, 2e-4
-"""Measurement noise: relative for costs, in FLIP for pictures."""
+"""Measurement noise: of costs (relative) and of errors (FLIP)."""
 _FAIR: Mapping[str, Mapping[str, str]] = {
     "unwrap": {"environment_height": "32"},
     "environment_height": {"environment_shadow": "none", "recover": "white_card"},
 }
-"""Other methods with which a setting is measured. Footprints on the ball matter only with coarse texels. For the map's
-size, few random rays and the division of its energy among emitters would hide its own effect."""
+"""Methods of other settings with which a setting is measured, in place of ``BASE``. The methods of ``unwrap`` differ
+only with coarse texels. The effect of ``environment_height`` would be hidden by the noise of few random rays, and by
+the division of the map's energy among emitters."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One method of one setting in one case."""
+    """Measurement of one method of one setting in one case."""
 
     case: str
     setting: str
@@ -73,25 +76,29 @@ class Row:
     flip: float
     """Mean FLIP of the picture per changed pixel."""
     against: str
-    """Reference of ``flip``: ``truth`` or ``last method``."""
+    """Picture with which ``flip`` compares: ``truth`` or ``last method``."""
     error: float = 0.0
-    """Error as the module's docstring defines it."""
+    """Error of the method, which the module's docstring defines."""
     dominated: bool = False
     """True if another method costs no more and has no larger error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Whole:
-    """A preset or a choice, measured as a whole."""
+    """Measurement of whole frames at one quality: a preset or a choice of the cost table."""
 
     label: str
+    """Name of the quality."""
     milliseconds: float
     """Median time per frame, without tracking."""
     flip: float
+    """Mean FLIP of the pictures per changed pixel."""
     settings: Mapping[str, str]
+    """Method of each setting."""
     images: Mapping[int, Image]
+    """Compared pictures, by frame."""
     over_paper: float = math.nan
-    """Median ratio of its frame times to the paired ones of the preset ``paper``."""
+    """Median over the frames of the ratio of their time to that with the preset ``paper``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,11 +130,12 @@ def measure_methods(
         case: Frames, with their truth if it is known.
         device: ``cpu`` or ``cuda:N``.
         settings: Settings to vary.
-        tell: Receives a description of each finished step.
-        quick: Whether to leave out brute force.
+        tell: Function to which a description of each step is passed.
+        quick: True to leave out brute force.
 
     Returns:
-        The report, without presets, and our choices at the paper's time and at its error if all settings were varied.
+        The report, without whole frames; and, if all settings were varied, the choices of the cost table at the paper's
+        time and at its error.
     """
     size = case.scene.camera.width, case.scene.camera.height
     shown = case.frames[-1].image, case.poses[-1]
@@ -160,8 +168,8 @@ def measure_presets(
         case: Frames, with their truth if it is known.
         device: ``cpu`` or ``cuda:N``.
         qualities: Qualities by name.
-        tell: Receives a description of each finished step.
-        quick: Whether to leave out brute force where the truth is unknown.
+        tell: Function to which a description of each step is passed.
+        quick: True to leave out brute force in the reference, if the truth is unknown.
         clock: Clock in seconds.
     """
     reference = case.truth
@@ -184,14 +192,15 @@ def run(
 ) -> dict[Label, dict[int, Image]]:
     """Light a case's frames at several qualities and return the compared pictures of each.
 
-    Frames before a compared one are lit with cheap methods that keep the light, once for all qualities of equal light.
+    Frames before a compared one only serve to capture light. They are lit with cheap methods for the rest of the
+    picture, once for all qualities that capture light equally.
 
     Args:
         case: Frames, with the indices of the compared ones.
         qualities: Qualities of the compared pictures.
         device: ``cpu`` or ``cuda:N``.
-        tell: Receives a description of each step.
-        keep: Called with each pipeline that has made a compared picture.
+        tell: Function to which a description of each step is passed.
+        keep: Function that is called with each pipeline after it has made a compared picture.
     """
     images: dict[Quality, dict[int, Image]] = {quality: {} for quality in qualities.values()}
     for light in dict.fromkeys(map(light_only, images)):
@@ -213,11 +222,11 @@ def run(
 def run_in_turn(
     case: Case, qualities: Mapping[str, Quality], device: str, clock: Clock
 ) -> tuple[dict[str, list[float]], dict[str, dict[int, Image]]]:
-    """Light frames with several qualities in turn, so that disturbances affect all alike.
+    """Light frames with several qualities in turn, so that disturbances by other programs affect all equally.
 
     Returns:
-        Milliseconds of whole frames after the first ``WARM_UP`` (until the picture is on the host, without tracking),
-        and the compared pictures; by label.
+        Milliseconds of each frame after the first ``WARM_UP``, until the picture is on the host and without tracking;
+        and the compared pictures. Both are by label.
     """
     times: dict[str, list[float]] = {label: [] for label in qualities}
     images: dict[str, dict[int, Image]] = {label: {} for label in qualities}
@@ -258,7 +267,7 @@ def _run_wholes(
 
 
 def _equals(costs: Costs, settings: Sequence[Setting]) -> dict[str, Quality]:
-    """Return our choices at the paper's time and at its error, chosen as by ``--quality auto``."""
+    """Return the choices of the cost table at the paper's time and at its error, by their names."""
     errors = load_errors()
     front = pareto_front(make_method_costs(costs, errors))
     paper = {setting.name: chosen(PRESETS["paper"], setting) for setting in settings}
@@ -281,10 +290,10 @@ def sweep(
 
     Args:
         case: Frames, with their truth if it is known.
-        methods: Methods of each setting, in its order.
+        methods: Methods of each setting, in the setting's order.
         device: ``cpu`` or ``cuda:N``.
         costs: Measured costs of the methods.
-        tell: Receives a description of each step.
+        tell: Function to which a description of each step is passed.
         base: Quality of all settings but the varied one.
     """
     qualities = {
@@ -303,7 +312,14 @@ def sweep(
 def _rows_of(
     case: Case, setting: Setting, images: Mapping[str, Mapping[int, Image]], times: Mapping[str, float]
 ) -> list[Row]:
-    """Return a row for each method of a setting, from the compared pictures and the costs."""
+    """Return a row for each method of a setting.
+
+    Args:
+        case: Frames, with their truth if it is known.
+        setting: The setting.
+        images: Compared pictures of each method, by frame.
+        times: Cost of each method, milliseconds.
+    """
     last = list(images.values())[-1]
     reference = case.truth or last
     errors = {method: picture_error(case, reference, own) for method, own in images.items()}
@@ -342,15 +358,13 @@ def picture_error(
     images: Mapping[int, Image],
     last: Mapping[int, Image] | None = None,
 ) -> float:
-    """Return the error of pictures: FLIP summed and divided by the number of pixels that virtual content changes.
-
-    The result is the mean over the compared frames.
+    """Return the sum of FLIP over a picture, divided by the number of changed pixels, as the mean over frames.
 
     Args:
         case: Frames with their regions.
         reference: Pictures that determine the changed pixels.
         images: Pictures to evaluate.
-        last: Pictures to compare with; None: ``reference``.
+        last: Pictures with which they are compared; None: ``reference``.
     """
     errors = []
     for index, picture in reference.items():

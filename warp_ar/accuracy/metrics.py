@@ -18,19 +18,19 @@ from warp_ar.errors import UsageError
 Array = npt.NDArray[Any]
 
 CHANGED = 0.02
-"""Least difference, relative to full scale, that counts as changed by virtual content."""
+"""Smallest blurred difference, relative to full scale, for which a pixel counts as changed by virtual content."""
 BLUR = 3.0
-"""Standard deviation in pixels of the blur before that test, which suppresses noise."""
+"""Standard deviation in pixels of the blur of differences, which suppresses noise."""
 REACH = 9
-"""Width in pixels by which changed regions are dilated."""
+"""Side in pixels of the square by which changed regions are dilated."""
 CLIPPED_CODE = 254
-"""Code from which a channel counts as clipped."""
+"""8-bit code from which a channel counts as clipped."""
 FLIP_REACH = 32
-"""Distance in pixels within which a difference changes FLIP: its filters reach 10, and those at borders less."""
+"""Distance in pixels around differing pixels within which FLIP is computed; its filters reach 10 pixels or less."""
 
 
 def flip_map(reference: Array, test: Array) -> npt.NDArray[np.float32]:
-    """Return FLIP of every pixel, (height, width), 0 to 1; computed only near differences.
+    """Return FLIP of every pixel, (height, width), 0 to 1; it is computed only near differing pixels.
 
     Args:
         reference: uint8 RGB (height, width, 3).
@@ -54,7 +54,7 @@ def flip_map(reference: Array, test: Array) -> npt.NDArray[np.float32]:
 def _evaluate_flip(reference: Array, test: Array) -> npt.NDArray[np.float32]:
     """Return FLIP of every pixel by its authors' program."""
     try:
-        import flip_evaluator  # imported here: only measurements need it
+        import flip_evaluator  # imported here, because only measurements need it
     except ImportError as error:
         raise UsageError('FLIP needs the package flip-evaluator: pip install "warp-ar[tradeoff]"') from error
     pictures = (np.asarray(picture, np.float32) / 255.0 for picture in (reference, test))
@@ -63,7 +63,7 @@ def _evaluate_flip(reference: Array, test: Array) -> npt.NDArray[np.float32]:
 
 
 def changed_region(camera: Array, truth: Array) -> npt.NDArray[np.bool_]:
-    """Return the pixels in which the truth differs from the camera's frame beyond noise; both are uint8 RGB."""
+    """Return a mask of the pixels in which the truth differs from the camera's frame beyond noise; both uint8 RGB."""
     difference = np.abs(camera.astype(np.float32) - truth.astype(np.float32)).max(-1) / 255.0
     blurred = cv2.GaussianBlur(difference, (0, 0), BLUR)
     widened = cv2.dilate((blurred > CHANGED).astype(np.uint8), np.ones((REACH, REACH), np.uint8))
@@ -71,5 +71,5 @@ def changed_region(camera: Array, truth: Array) -> npt.NDArray[np.bool_]:
 
 
 def clipped_region(camera: Array) -> npt.NDArray[np.bool_]:
-    """Return the pixels of a uint8 RGB frame in which some channel clips."""
+    """Return a mask of the pixels of a uint8 RGB frame in which some channel clips."""
     return np.asarray((camera >= CLIPPED_CODE).any(-1))

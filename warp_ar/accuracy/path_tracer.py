@@ -1,8 +1,8 @@
 """Progressive path tracing of a frame, with a standard error for every pixel.
 
-``kernels/reference/path_tracer.py`` and ``path_following.py`` define the estimated sum. Like the pipeline, the path
-tracer is given the scene, the environment's light, and one frame with its pose. It makes no other approximation, so
-that with enough samples it is the reference for the pipeline's methods.
+``kernels/reference/path_tracer.py`` and ``path_following.py`` define the integral that is estimated. The inputs are
+those of the pipeline: the scene, the light of the environment, and one frame with its pose. Given these, the path
+tracer makes no approximation, so that with enough samples it is the reference for the pipeline's methods.
 """
 
 from __future__ import annotations
@@ -55,39 +55,42 @@ Image = npt.NDArray[np.uint8]
 DEFAULT_SAMPLES = 256
 """Default number of samples per pixel."""
 LIGHT_SAMPLES = 32
-"""Samples per pixel that estimate the reflectance of proxies before the picture."""
+"""Default number of samples per pixel for the reflectance of proxies, which is estimated before the picture."""
 FIRST_LIGHT_SAMPLES = 4
-"""Number of ``LIGHT_SAMPLES`` after which each proxy's mean reflectance is estimated."""
+"""Number of these samples after which each proxy's mean reflectance is first estimated."""
 UNKNOWN_REFLECTANCE = 0.5
 """Reflectance of a proxy that is visible in no pixel."""
 DFG_SIZE = 32
 """Rows and columns of the table of directional albedo."""
 PART = 2048
-"""Samples that a CPU thread traces at a time."""
+"""Number of samples that a CPU thread traces at a time."""
 MOST_SAMPLES = 1 << 21
 """Largest number of samples of a round on CPU."""
 MOST_CUDA_SAMPLES = 1 << 25
-"""Largest number of samples of a round on a GPU with ``SAMPLE_BYTES`` of free memory for each."""
+"""Largest number of samples of a round on a GPU, if its free memory has ``SAMPLE_BYTES`` for each."""
 SAMPLE_BYTES = 512
-"""Free bytes needed for each sample of a round: several times its use."""
+"""Number of free bytes required for each sample of a round, which is several times the bytes it uses."""
 PATHS_OF_LIGHTS = 0.25
-"""Paths per pixel and pass from virtual lights, and as many from near emitters."""
+"""Number of paths from virtual lights per pixel and pass (one sample per pixel); there are as many from near
+emitters."""
 FIRST_ROUND = 16
-"""Samples per pixel after which noise and guiding are updated; again at each doubling."""
+"""Number of samples per pixel after which samples are first distributed by the noise; it is repeated at each
+doubling."""
 AROUND = 9
-"""Width in pixels of the square over which a pixel's noise is averaged."""
+"""Side in pixels of the square over which a pixel's noise is averaged."""
 LEAST_SHARE, MOST_SHARE = 0.25, 32.0
-"""Bounds of a pixel's samples relative to the mean; the lower one keeps searching for rare light."""
+"""Bounds of a pixel's number of samples relative to the mean. With the lower one, pixels without noise so far still get
+samples, which may find rare light."""
 LEAST_CHANGE = 1e-4
-"""Least difference from the frame, in camera values, of a pixel that shows something virtual."""
+"""Smallest difference from the linear frame of a pixel that shows something virtual."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TracedPicture:
-    """Picture of the samples so far, with its error."""
+    """Picture of the samples so far, with its standard error."""
 
     radiance: FloatImage
-    """Linear radiance in camera values, unclipped, (H, W, 3)."""
+    """Linear radiance, unclipped, in units of the camera's clipping, (H, W, 3)."""
     error: FloatImage
     """Standard error of ``radiance``, (H, W, 3)."""
     image: Image
@@ -95,10 +98,10 @@ class TracedPicture:
     samples: int
     """Mean number of samples per pixel."""
     seconds: float
-    """Seconds of sampling, from the first sample on."""
+    """Total seconds that sampling took."""
     relative_error: float
-    """RMS of the standard error over RMS of the radiance, in pixels that virtual objects and lights change; errors of
-    clipped pixels count as far as they are visible."""
+    """RMS of the standard error divided by RMS of the radiance, over pixels that virtual objects and lights change. The
+    error of a pixel that clips is reduced to the visible part."""
 
 
 def _relative_error(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> float:
@@ -118,24 +121,24 @@ def _changed(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -
 
 
 def _seen_noise(picture: FloatImage, error: FloatImage) -> npt.NDArray[np.float64]:
-    """Return the visible standard error, which is 0 in pixels that surely clip, (H, W, 3)."""
+    """Return the visible standard error, (H, W, 3): 0 where the radiance clips by more than it, and at most 1."""
     return np.where(picture - error > 1.0, 0.0, np.minimum(error, 1.0)).astype(np.float64)
 
 
-# With n_i of N samples in pixel i, the variance of the picture is the sum of v_i / n_i, where v_i is the variance of
-# one sample. It is least for n_i in proportion to the square root of v_i. v_i is estimated from the neighbours: if a
-# pixel's own samples decided how many more it gets, its mean would be biased, because sampling would continue until a
-# bright one came. Only neighbours with the same kind of surface are used: the noise of an object and of the desk next
-# to it differ.
+# Let pixel i have n_i of N samples, and let v_i be the variance of one sample in it. The variance of the picture is the
+# sum of v_i / n_i. It is least for n_i in proportion to the square root of v_i. The neighbours give the estimate of
+# v_i. If a pixel's own samples decided how many more it gets, its mean would be biased, because sampling would continue
+# until a bright sample came. Only neighbours with the same kind of surface are used, because the noise of an object
+# differs from that of the desk next to it.
 def sample_shares(
     picture: FloatImage, error: FloatImage, samples: npt.NDArray[np.int32], proxies: FloatImage
 ) -> FloatImage:
-    """Return the samples of each pixel in a pass, with mean 1, by the noise of the surrounding pixels.
+    """Return the number of samples of each pixel in a pass, (H, W) with mean 1, by the noise of surrounding pixels.
 
     Args:
         picture: Linear radiance, (H, W, 3).
         error: Standard error of the radiance, (H, W, 3).
-        samples: Samples of each pixel so far, (H, W).
+        samples: Number of samples of each pixel so far, (H, W).
         proxies: Share of each pixel's samples that show a proxy, (H, W).
     """
     variance = (_seen_noise(picture, error) ** 2).mean(axis=2) * samples
@@ -155,10 +158,10 @@ def sample_shares(
 
 
 class PathTracer:
-    """Path-traces one frame of a scene.
+    """Path tracer of one frame of a scene.
 
-    ``sample`` adds samples; ``picture`` returns their result so far. On one device the same arguments and seed give a
-    bit-identical picture, in however many steps samples are added.
+    ``sample`` adds samples; ``picture`` returns the result of all samples so far. On one device, equal arguments and
+    seeds give a bit-identical picture, in however many steps samples are added.
     """
 
     def __init__(
@@ -179,18 +182,18 @@ class PathTracer:
 
         Args:
             scene: Scene to trace.
-            light: Environment in the world's axes: latlong radiance (h, 2 h, 3) in camera values, or a captured light,
-                whose emitters of known distance are placed there.
-            frame: Camera frame without anything virtual, (H, W, 3): encoded (uint8) or linear (float32). None: physical
-                surfaces have ``reflectances``, and the picture shows the whole scene, including physical surfaces and
-                environment.
+            light: Environment in the world's axes: latlong radiance (h, 2 h, 3) in units of the camera's clipping, or a
+                captured light, whose emitters are placed at their distances if these are known.
+            frame: Camera frame without anything virtual, (H, W, 3): encoded (uint8) or linear (float32). None: the
+                picture shows the whole scene, including the environment and the physical surfaces, which have
+                ``reflectances``.
             pose: ``camera_from_world``.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             size: Width and height of the picture; None means the camera's. The frame is averaged to this size.
             seconds: Time since the first frame, for animations.
             seed: Seed of the random numbers, 0 or more.
             reflectances: RGB reflectance of each proxy if there is no frame; None: 0.5.
-            light_samples: Samples per pixel that estimate the reflectance of proxies; more than FIRST_LIGHT_SAMPLES.
+            light_samples: Number of samples per pixel for the reflectance of proxies, above ``FIRST_LIGHT_SAMPLES``.
 
         Raises:
             UsageError: The frame, the light, the seed or the reflectances cannot be used.
@@ -209,11 +212,11 @@ class PathTracer:
         self._followed = 0
         """Number of passes of paths from virtual lights so far."""
         self._work, self._sliced, self._goal = self._all_work(), False, 0
-        """Remaining work; whether it is done pass by pass; if not, the number of samples per pixel to reach."""
+        """Remaining work; True if it is done pass by pass; and otherwise the number of samples per pixel to reach."""
         self._compiled: set[str] = set()
         self._prepared = False
         self._passes = 0
-        """Number of passes with the current shares."""
+        """Number of passes since samples were last distributed among pixels."""
         self._linear = None if frame is None else _linear_frame(frame, self.camera)
         self._config = trace_variant(trace_config(scene), self.device)
         with translating(self.device), wp.ScopedDevice(self.device):
@@ -227,7 +230,7 @@ class PathTracer:
             self._part = self._most = max(1, min(MOST_CUDA_SAMPLES, self.device.free_memory // SAMPLE_BYTES))
 
     def _allocate(self) -> None:
-        """Allocate the moments, with no samples, and the arrays of the picture."""
+        """Allocate the moments (sums over samples), which are 0, and the arrays of the picture."""
         shape = (self.camera.height, self.camera.width)
         self._moments = make_moments(shape, self.device)
         self._round = make_round(shape, self.device)
@@ -242,14 +245,21 @@ class PathTracer:
         self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
 
     def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
-        """Return the scene in the form that paths intersect."""
+        """Return the scene in the form that kernels intersect with paths.
+
+        Args:
+            radiance: Environment, latlong (h, 2 h, 3).
+            emitters: Records of the emitters with known distances.
+            seconds: Time since the first frame.
+        """
         local = LocalScene()
         device, shape = self.device, (self.camera.height, self.camera.width)
         objects = np.zeros(self._host.shape_count, structs.struct_dtype(structs.Shape))
         lights = np.zeros(len(self.scene.lights), structs.struct_dtype(structs.Light))
         self._host.write_objects(objects, seconds)
         self._host.write_lights(lights, seconds)
-        # Without a frame the first surface's reflectance is a factor of each path, not of the sum of paths.
+        # Paths from lights need a frame: without one, the first surface's reflectance is a factor of each path, not of
+        # their sum.
         materials, known = self._host.ray_scene.materials.numpy(), self._linear is not None
         self._follows_lights = known and follows_lights(lights, objects, materials)
         local.rays = self._host.ray_scene
@@ -303,7 +313,10 @@ class PathTracer:
     def _trace(self, asked: int, first: int, count: int) -> Iterator[None]:
         """Trace passes in rounds as large as memory allows, each in parts that run in parallel on the cores.
 
-        ``first`` is the index of a pixel's first sample in the moments.
+        Args:
+            asked: Quantity to estimate, a constant of the kernels' ``path_tracer``.
+            first: Index in the random sequence of a pixel's first sample in the moments.
+            count: Number of passes.
         """
 
         def trace(part: tuple[int, int]) -> None:
@@ -326,7 +339,7 @@ class PathTracer:
                     yield from self._follow_lights()
 
     def _follow_lights(self) -> Iterator[None]:
-        """Trace the paths of a pass from virtual lights, in parts as ``_in_parts`` makes them."""
+        """Trace the paths of a pass from virtual lights and near emitters, in parts."""
         each = self._paths_of_each()
         of_lights = each if self._follows_lights else 0
         count = of_lights + (each if self._follows_emitters else 0)
@@ -339,11 +352,17 @@ class PathTracer:
         self._followed += 1
 
     def _paths_of_each(self) -> int:
-        """Return the number of paths of a pass from virtual lights, which is also that from near emitters."""
+        """Return the number of paths of a pass from virtual lights; the number from near emitters is equal."""
         return math.ceil(PATHS_OF_LIGHTS * self.camera.width * self.camera.height)
 
     def _in_parts(self, kind: str, trace: Callable[[tuple[int, int]], None], count: int) -> Iterator[None]:
-        """Trace ``count`` threads in parts on all cores; if work is done pass by pass, yield after a part per core."""
+        """Trace samples or paths in parts on all cores; if work is done pass by pass, yield after one part per core.
+
+        Args:
+            kind: Name of the kernel, which is compiled by the first part.
+            trace: Function that traces a range of threads of the kernel.
+            count: Number of threads.
+        """
         parts = [(start, min(start + self._part, count)) for start in range(0, count, self._part)]
         if len(parts) == 1 or (parts and kind not in self._compiled):
             with translating(self.device), wp.ScopedDevice(self.device):
@@ -357,7 +376,7 @@ class PathTracer:
                 yield
 
     def _all_work(self) -> Iterator[bool]:
-        """Yield after each part of the work; True when the samples of every pixel are complete."""
+        """Do the work without end; yield after each part: True if passes over all pixels are complete, else False."""
         asked = path_tracer.WHOLE
         if self._linear is not None:
             asked = path_tracer.DIFFERENCE
@@ -384,7 +403,7 @@ class PathTracer:
             yield True
 
     def prepare(self) -> None:
-        """Estimate the reflectance of proxies, if it was not done; ``sample`` calls this."""
+        """Estimate the reflectance of proxies, if this was not done yet; ``sample`` calls this method."""
         self._sliced = False
         while not self._prepared:
             next(self._work)
@@ -402,7 +421,7 @@ class PathTracer:
         self._passes = 0
 
     def _share(self) -> None:
-        """Distribute the next samples among pixels by the noise so far, after ``FIRST_ROUND`` and each doubling."""
+        """Distribute the next samples by the noise so far; this is done after ``FIRST_ROUND`` and each doubling."""
         rounds, rest = divmod(self.samples, FIRST_ROUND)
         if rest or not rounds or rounds & (rounds - 1):
             return
@@ -414,14 +433,14 @@ class PathTracer:
         self._passes = 0
 
     def _finish(self) -> None:
-        """Write picture and error from the moments."""
+        """Compute picture and error from the moments."""
         kinds = int(self._follows_lights) + int(self._follows_emitters)
         followed = self._followed * kinds * self._paths_of_each() / (self.camera.width * self.camera.height)
         given = self._local.matt, self._encode, self._moments, self._image_of_lights, followed, self.exposure
         finish_picture(*given, self._radiance, self._error, self._sampled, self._image)
 
     def sample(self, count: int) -> None:
-        """Add ``count`` samples per pixel on average; after ``FIRST_ROUND``, more where neighbours are noisy.
+        """Add ``count`` samples per pixel on average; after ``FIRST_ROUND``, noisy neighbourhoods get more of them.
 
         Raises:
             UsageError: The count is not positive.
@@ -438,9 +457,9 @@ class PathTracer:
         self._seconds += time.perf_counter() - start
 
     def sample_for(self, seconds: float) -> bool:
-        """Add samples for about the given time, in parts of a few rows.
+        """Add samples for about the given time, in small parts.
 
-        After each complete pass the picture equals that of ``sample``.
+        After each complete pass, the picture equals that of ``sample`` with as many samples.
 
         Returns:
             True if a pass over the whole picture was completed.
@@ -470,19 +489,19 @@ class PathTracer:
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
 
     def shown(self) -> npt.NDArray[np.int32]:
-        """Index of the only proxy that the frame shows in each pixel; -1 for none or several surfaces, (H, W)."""
+        """Return the index of the only proxy that the frame shows in each pixel, (H, W); -1 for none or several."""
         self.prepare()
         with exclusive(self.device):
             return np.array(self._local.shown.numpy())
 
     def reflectance(self) -> FloatImage:
-        """Reflectance of the proxy in each pixel, estimated from frame and light; 0 elsewhere, (H, W, 3)."""
+        """Return the reflectance of the proxy in each pixel, (H, W, 3), estimated from frame and light; 0 elsewhere."""
         self.prepare()
         with exclusive(self.device):
             return np.array(self._local.reflectance.numpy())
 
     def frame(self) -> FloatImage:
-        """Linear frame at the picture's size, (H, W, 3).
+        """Return the linear frame at the picture's size, (H, W, 3).
 
         Raises:
             UsageError: The tracer has no frame.
@@ -492,7 +511,7 @@ class PathTracer:
         return self._linear
 
     def rays(self) -> int:
-        """Number of rays that were traced so far."""
+        """Return the number of rays that were traced so far."""
         with exclusive(self.device):
             rays = self._moments.rays.numpy().astype(np.int64).sum() + self._image_of_lights.rays.numpy().sum()
         return int(rays)
@@ -504,7 +523,7 @@ class PathTracer:
         error: float | None = None,
         step: int = 16,
     ) -> Iterator[TracedPicture]:
-        """Yield pictures of increasing quality, one per ``step`` samples.
+        """Yield pictures with ever more samples, one per ``step`` samples per pixel.
 
         Args:
             samples: Samples per pixel at which to stop.
@@ -537,7 +556,11 @@ def _near_emitters(light: Light | FloatImage) -> npt.NDArray[Any]:
 
 
 def _linear_frame(frame: Image | FloatImage, camera: Any) -> FloatImage:
-    """Return the linear radiance of a frame at the camera's size."""
+    """Return the linear radiance of a frame, (H, W, 3), averaged to the camera's size.
+
+    Raises:
+        UsageError: The frame has another type or aspect ratio.
+    """
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype not in (np.uint8, np.float32):
         raise UsageError(f"frame is {frame.dtype} {frame.shape}: expected uint8 or float32 (height, width, 3)")
     linear = frame

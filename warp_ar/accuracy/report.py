@@ -25,14 +25,14 @@ from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import PRESETS
 
 MIN_COLUMNS = 110
-"""Least width of tables if there is no terminal, so that none is cut off."""
+"""Smallest width of tables in characters if there is no terminal, so that no table is cut off."""
 
 
 def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """Return error and cost of every method, and the methods that are dominated in every case.
+    """Return the cost table: error and cost of every method, and the methods that are dominated in every case.
 
-    ``errors`` is FLIP per changed pixel, averaged over the cases in which the setting matters; on different devices it
-    differs by rounding only. ``milliseconds`` is averaged likewise, for this device.
+    ``errors`` (FLIP per changed pixel, in excess of the best method) and ``milliseconds`` are averaged over the cases
+    in which the setting matters. Errors on different devices differ by rounding only; times are those on this device.
     """
     tables: dict[str, dict[str, Any]] = {"errors": {}, "milliseconds": {}, "dominated": {}}
     for setting in SETTINGS:
@@ -54,7 +54,7 @@ def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any
 
 
 def make_preset_list(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
-    """Return error and milliseconds of whole frames of every preset, by case."""
+    """Return a table with error and milliseconds of whole frames at every preset, by case."""
     return {"program": PROGRAM, "made": _made(reports, device), "presets": _presets(reports)}
 
 
@@ -85,7 +85,7 @@ def _made(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
 def commit() -> str:
     """Return the short hash of the checkout, with a + for uncommitted changes; ``unknown`` outside a checkout.
 
-    ``WARP_AR_COMMIT`` states it for copies without the history.
+    The environment variable ``WARP_AR_COMMIT``, if set, replaces it, for copies without history.
     """
     if "WARP_AR_COMMIT" in os.environ:
         return os.environ["WARP_AR_COMMIT"]
@@ -98,7 +98,7 @@ def commit() -> str:
 
 
 def device_name(alias: str) -> str:
-    """Return the name of a device for people; for a CPU with the number of cores that this process may use."""
+    """Return the full name of a device; for a CPU with the number of cores that this process may use."""
     device = wp.get_device(alias)
     if not device.is_cpu:
         return str(device.name)
@@ -143,7 +143,7 @@ def print_table(
 
 def records(report: CaseReport, device: str) -> Iterator[dict[str, Any]]:
     """Yield one record per method and per whole preset, for JSON lines."""
-    signed = {"program": PROGRAM}  # first, because a file is recognised by its first key
+    signed = {"program": PROGRAM}  # comes first, because files are recognised by their first key
     common = {"device": device_name(device), "warp": wp.__version__}
     for row in report.rows:
         yield {**signed, "kind": "method", **dataclasses.asdict(row), **common}

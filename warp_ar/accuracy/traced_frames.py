@@ -1,4 +1,4 @@
-"""Path-traced frames of a run, in the light that its pipeline finds: ``warp_ar.live --samples N``."""
+"""Path-traced frames of a run, with the light and the poses that its pipeline finds: ``warp_ar.live --samples N``."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from warp_ar.errors import UsageError
 
 @dataclasses.dataclass
 class TracedFrames:
-    """Path-traces a pipeline's frames in the same light and pose.
+    """Path tracing of a pipeline's frames, with the pipeline's light and poses.
 
-    Each frame must be passed before the pipeline begins the next one, because the pipeline holds only the current
-    light.
+    Each frame must be passed before the pipeline begins the next one, because the pipeline holds only the latest light.
     """
 
     pipeline: Pipeline
+    """Pipeline that lights the frames."""
     samples: int
     """Largest number of samples per pixel."""
     error: float | None = None
@@ -37,7 +37,7 @@ class TracedFrames:
             raise UsageError("--samples needs a preset as --quality, which estimates the light; auto is none")
 
     def __call__(self, frame: Any, result: Any) -> Image:
-        """Return the traced picture of a frame; the pipeline's if the marker is lost or the exposure is not shown."""
+        """Return the traced picture of a frame, or the pipeline's if the marker is lost or the frame is not shown."""
         self.first = frame.time if self.first is None else self.first
         if result.pose is None or not result.shown:
             return result.image  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""HTML page of ``warp_ar.tradeoff``: one file with pictures and charts, without scripts or links to others."""
+"""HTML page of ``warp_ar.tradeoff``: one file with pictures and charts, without scripts or links to other files."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ Cells = Sequence[str]
 
 
 def data_uri(image: Image) -> str:
-    """Return an RGB picture as a data URI.
+    """Return an RGB picture as a data URI (WebP).
 
     Raises:
-        ValueError: It cannot be encoded.
+        ValueError: The picture cannot be encoded.
     """
     bgr = np.ascontiguousarray(image[..., ::-1])
     done, code = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
@@ -60,13 +60,19 @@ def data_uri(image: Image) -> str:
 
 
 def figure(image: Image, caption: str) -> str:
-    """Return a picture and its caption."""
+    """Return the HTML of a picture and its caption."""
     text = html.escape(caption, quote=True)
     return f'<figure><img loading="lazy" src="{data_uri(image)}" alt="{text}"><figcaption>{text}</figcaption></figure>'
 
 
 def strip(columns: Mapping[str, Image], reference: Image, box: Box) -> str:
-    """Return crops side by side, and below each its error relative to ``reference``."""
+    """Return the HTML of crops side by side, with the FLIP between each crop and the reference below it.
+
+    Args:
+        columns: Pictures by their captions.
+        reference: Picture with which they are compared.
+        box: Part of the pictures that is shown.
+    """
     parts = [figure(crop(image, box), label) for label, image in columns.items()]
     for label, image in columns.items():
         errors = flip_map(reference, image)
@@ -76,7 +82,12 @@ def strip(columns: Mapping[str, Image], reference: Image, box: Box) -> str:
 
 
 def table(head: Cells, rows: Iterable[tuple[Cells, bool]]) -> str:
-    """Return a table. Each row has a flag whether it is greyed out; a row of a single cell is a heading."""
+    """Return the HTML of a table.
+
+    Args:
+        head: Names of the columns.
+        rows: Cells of each row, and True if it is grey; a row with a single cell is a heading.
+    """
     top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     body = []
     for cells, out in rows:
@@ -89,7 +100,7 @@ def table(head: Cells, rows: Iterable[tuple[Cells, bool]]) -> str:
 
 
 def split(chart: str, other: str, words: str) -> str:
-    """Return a chart with a table and a sentence next to it."""
+    """Return the HTML of a chart with a table and a sentence next to it."""
     words = f"<p class=soft>{html.escape(words)}</p>" if words else ""
     return f'<div class="split"><div class="card">{chart}</div><div class="card">{other}{words}</div></div>'
 
@@ -142,7 +153,7 @@ def _times(ratio: float) -> str:
 
 
 def whole_words(wholes: Sequence[Whole]) -> str:
-    """Return time and error of our choices relative to the paper's method, in words, whichever is better."""
+    """Return sentences on time and error of our choices relative to the preset ``paper``; empty without that preset."""
     by_label = {whole.label: whole for whole in wholes}
     paper = by_label.get("paper")
     if paper is None or paper.flip <= 0.0:
@@ -156,7 +167,7 @@ def whole_words(wholes: Sequence[Whole]) -> str:
 
 
 def _less(a: float, b: float) -> str:
-    """Return the change from b to a in words."""
+    """Return the relative change from b to a in words, such as "20% less"."""
     change = 1.0 - a / b
     return "the same" if abs(change) < 0.005 else f"{change:.0%} less" if change > 0.0 else f"{-change:.0%} more"
 
@@ -167,7 +178,7 @@ def _setting_section(report: CaseReport, rows: Sequence[Row]) -> str:
     pictures = {row.method: report.pictures[setting.name, row.method] for row in rows}
     first, *_, last = [report.pictures[setting.name, row.method] for row in (*rows, rows[-1])]
     reference = report.reference[index] if report.case.truth else last
-    # Crop where the methods differ.
+    # The crop shows where the methods differ.
     difference = np.abs(first.astype(int) - last.astype(int)).max(-1)
     box = bounding_box(difference > max(4, int(0.3 * difference.max())), difference.shape)
     columns = {**pictures, "truth": reference} if report.case.truth else pictures
@@ -190,7 +201,7 @@ def _setting_section(report: CaseReport, rows: Sequence[Row]) -> str:
 
 
 def _list_section(reports: Sequence[CaseReport]) -> str:
-    """Return every method of every setting over all cases: the cost table."""
+    """Return the section with the cost table: every method of every setting, over all cases."""
     rows: list[tuple[Cells, bool]] = []
     for setting in SETTINGS:
         measured = [row for report in reports for row in report.rows if row.setting == setting.name]
@@ -218,7 +229,12 @@ def _list_section(reports: Sequence[CaseReport]) -> str:
 
 
 def _introduction(made: Mapping[str, Any], *, by_clock: bool) -> str:
-    """Return the page's head and its explanation."""
+    """Return the page's head and introduction.
+
+    Args:
+        made: Conditions of the measurement.
+        by_clock: True if times are elapsed time, False if they are processor time.
+    """
     counted = "" if by_clock else " Milliseconds of whole frames are processor time, of all threads."
     ramp = error_colors(np.linspace(0.0, 1.0, 128)[None].repeat(4, 0) ** 2)
     # The colour ramp follows the square root of the error.
@@ -243,8 +259,9 @@ def render(reports: Sequence[CaseReport], made: Mapping[str, Any]) -> str:
     """Return the whole page.
 
     Args:
-        reports: One per case.
-        made: Conditions: ``device``, ``warp``, and ``clock``, which is ``time`` or ``processor time``.
+        reports: One report per case.
+        made: Conditions of the measurement: ``device``, ``warp`` (version), and ``clock``, which is ``time`` or
+            ``processor time``.
     """
     by_clock = made.get("clock", "time") == "time"
     limit = REAL_TIME if by_clock else None

@@ -29,29 +29,36 @@ Image = NDArray[np.uint8]
 SMALL: Final = 14.0
 """Radius in pixels below which a ball resolves too little of the environment."""
 INNER: Final = 0.8
-"""Share of the radius within which the ball's pixels are tested."""
+"""Share of the ball's radius within which its pixels are tested."""
 CLIPPED: Final = 0.2
-"""Largest share of clipped pixels in the ball: lamps and windows may clip, walls must not."""
+"""Largest share of clipped pixels in the ball: reflections of lamps and windows may clip, those of walls must not."""
 DULL: Final = 0.10
-"""Ratio of standard deviation to mean of the codes inside the ball, below which it shows no reflections."""
+"""Ratio of standard deviation to mean of the 8-bit codes inside the ball, below which it shows no reflections."""
 RADIUS: Final = 0.03
-"""Relative difference of radii that an outline must exceed to contradict the scene, in addition to three standard
-deviations."""
+"""Relative difference between the radius that the outlines give and the scene's, beyond which they contradict. The
+difference must also exceed three standard deviations."""
 PLACE: Final = 0.15
-"""Largest error of the centre, relative to the radius, if an outline is visible."""
+"""Largest error of the scene's centre, relative to the radius, if an outline is visible."""
 SEEN: Final = 0.46
 """Smallest visible share of the outline of an unoccluded ball.
 
-An unoccluded ball, parts of whose rim resemble the background, has 0.50 to 0.97; a half hidden ball has 0.44.
+Unoccluded balls have 0.50 to 0.97, because parts of the rim may resemble the background. A half hidden ball has 0.44.
 """
 SIDES: Final = 6
-"""Number of frames in which the surface below the ball is searched in the ball's place."""
+"""Largest number of frames in which it is tested whether the surface below the ball is visible where the ball should
+be."""
 LOST: Final = 0.35
 """Visible share of the outline below which there is no ball."""
 
 
 def check_balls(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
-    """Return the findings for every mirror ball."""
+    """Return the findings for every mirror ball.
+
+    Args:
+        scene: Scene with the balls.
+        look: Frames of the scene.
+        views: Largest number of frames in which outlines are searched.
+    """
     if not look.views:
         return []
     few = look.views[:: -(-len(look.views) // views)]
@@ -63,9 +70,9 @@ def check_balls(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
 
 
 def inside_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> float:
-    """Return standard deviation over mean inside a ball's outline, median over frames.
+    """Return the standard deviation of codes over their mean inside a ball's outline, as the median over frames.
 
-    Below ``DULL`` for paper and paint.
+    It is below ``DULL`` for paper and paint, and 0 if no frame shows the ball's place.
     """
     circles = [(image, rough_circle(camera, pose, probe)) for image, pose in views]
     parts = [disc_contrast(image, circle) for image, circle in circles if circle is not None]
@@ -73,7 +80,7 @@ def inside_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: 
 
 
 def disc_contrast(image: Image, circle: tuple[float, float, float]) -> float:
-    """Return standard deviation over mean of a picture inside a circle (x, y, radius) in pixels."""
+    """Return the standard deviation of codes over their mean inside a circle (x, y, radius) in pixels."""
     part = ball_codes(image, [circle], INNER).astype(float)
     return float(part.std() / max(part.mean(), 1.0)) if len(part) else 0.0
 
@@ -116,7 +123,7 @@ def _check_ball(
     off = _compare(probe, solution, label, command)
     others = [other for other in scene.probes if other is not probe]
     seen_ball = dataclasses.replace(probe, center=solution.center, radius=solution.radius)
-    # A ball that explains its mirror image is right; the contradicting outlines are edges near its rim.
+    # If the scene's ball explains its mirror image better than the solution does, the outlines are other edges.
     if off and explains_better(views, look.camera, probe, seen_ball, scene.proxies, others):
         off = []
     return [*found, *(off or _check_reflectance(scene, look, views, probe, label))]
@@ -143,7 +150,14 @@ def _check_reflectance(
 
 
 def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> list[Finding]:
-    """Return the findings on differences between the solution and the scene's numbers."""
+    """Return the findings on differences between a ball found in pictures and the scene's.
+
+    Args:
+        probe: The scene's ball.
+        solution: The ball that explains the outlines.
+        label: Name of the ball in messages.
+        command: Command that measures the ball.
+    """
     if not solution.radius_assumed:
         off = solution.radius - probe.radius
         if abs(off) > max(RADIUS * probe.radius, 3 * solution.radius_deviation):
@@ -163,7 +177,7 @@ def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> 
 
 
 def is_in_view(look: Look, pose: Pose, probe: Probe) -> bool:
-    """Return True if a ball is inside the picture for a camera pose."""
+    """Return True if a ball's centre is in the picture for a camera pose, or at most half a radius outside it."""
     circle = rough_circle(look.camera, pose, probe)
     return circle is not None and _inside(look, circle)
 
@@ -174,7 +188,7 @@ def _inside(look: Look, circle: tuple[float, float, float]) -> bool:
 
 
 def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, float, float]) -> bool:
-    """Return True if a circle (x, y, radius), pixels, is inside the printed marker or board."""
+    """Return True if a circle (x, y, radius) in pixels is inside the picture of the printed marker or board."""
     outline = project(camera, pose.apply(printed_cells(marker)[3]))
     if not np.isfinite(outline).all():
         return False
@@ -185,7 +199,15 @@ def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, 
 def _why_lost(
     marker: Marker, look: Look, views: tuple[tuple[Image, Pose], ...], label: str, contrast: float
 ) -> Finding:
-    """Return the finding on a missing ball: it is elsewhere, is painted, or is absent."""
+    """Return the finding on a ball that is not seen, and its likely cause: it is elsewhere, painted or absent.
+
+    Args:
+        marker: The scene's marker.
+        look: Frames of the scene.
+        views: Frames in which the ball was searched.
+        label: Name of the ball in messages.
+        contrast: Contrast at the ball's place, as returned by ``disc_contrast``.
+    """
     command = "check center and radius, and that nothing hides the ball"
     if contrast < 0.5 * DULL:
         text = f"{label}: the picture of the ball shows no reflections: it is painted, covered or not there"

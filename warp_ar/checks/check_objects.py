@@ -24,7 +24,13 @@ MOST_POSES: Final = 120
 
 
 def check_objects(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> list[Finding]:
-    """Return a finding that names the objects outside all pictures; arguments are those of ``find_outside``."""
+    """Return a finding that names the objects outside all pictures, if there are any.
+
+    Args:
+        scene: The scene.
+        camera: Camera of the pictures.
+        poses: ``camera_from_world`` of each picture.
+    """
     found = find_outside(scene, camera, poses)
     if not found:
         return []
@@ -35,9 +41,10 @@ def check_objects(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> list[F
 
 
 def find_outside(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> dict[int, str]:
-    """Return the indices of objects outside all pictures, each with its side relative to the first picture.
+    """Return the indices of objects outside all pictures, each with a phrase such as "left of the picture".
 
-    Objects that move, have a marker of their own, or serve as lights may be outside.
+    The phrase refers to the first picture. Objects that move, have a marker of their own, or emit light may be outside
+    and are left out.
 
     Args:
         scene: The scene.
@@ -51,7 +58,7 @@ def find_outside(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> dict[in
         try:
             ball = sphere_around(item)
         except SceneError:
-            continue  # the run reports the same error
+            continue  # this error is reported when the scene is run
         around = [ball_outline([ball])]
         if poses and all(screen_rects(around, pose, camera) == [EMPTY] for pose in poses):
             found[index] = _side(ball, poses[0], camera)
@@ -59,7 +66,7 @@ def find_outside(scene: Scene, camera: Camera, poses: Sequence[Pose]) -> dict[in
 
 
 def written_poses(scene: Scene) -> list[Pose]:
-    """Return a sample of the given poses of a scene without marker, spread over all frames."""
+    """Return a sample of the poses that a scene gives, spread over all frames; empty if it gives none."""
     if scene.pose is None:
         return []
     poses = scene.pose.poses
@@ -67,7 +74,7 @@ def written_poses(scene: Scene) -> list[Pose]:
 
 
 def sphere_around(item: Object) -> Probe:
-    """Return a sphere around an object at its initial place.
+    """Return a sphere around an object at time 0, as centre and radius of a ``Probe``.
 
     Raises:
         SceneError: Its mesh cannot be read.
@@ -89,7 +96,7 @@ def _sphere_of(mesh: Mesh) -> tuple[Array, float]:
 
 
 def _reach(item: Object) -> float:
-    """Return the largest distance of a non-mesh shape from its origin, in metres without its scale."""
+    """Return an upper bound on the distance of a non-mesh shape's points from its origin, in metres before scaling."""
     return max(
         item.major_radius + item.minor_radius,
         math.hypot(item.radius, item.length / 2),

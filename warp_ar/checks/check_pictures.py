@@ -27,61 +27,63 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 RARE: Final = 0.6
-"""Share of frames with the marker below which it is visible too rarely."""
+"""Share of frames that show the marker, below which there are too few."""
 CELL_PIXELS: Final = 3.0
-"""Smallest side in pixels of cells that are read reliably."""
+"""Smallest side in pixels of a marker's cells (its black and white squares) that are read reliably."""
 WORST_EDGES: Final = 1.0
-"""Largest distance in pixels between a print's edges and their places by the pose; a right lens and board give 0.1 to
-0.4."""
+"""Largest root mean square distance in pixels between a print's edges in the picture and their places under the pose.
+Correct settings of lens and board give 0.1 to 0.4."""
 CLIPPED: Final = 250
-"""Code from which white paper counts as clipped."""
+"""8-bit code from which white paper counts as clipped."""
 CLIPPED_SHARE: Final = 0.25
 """Largest share of clipped white cells."""
 DARK: Final = 0.04
-"""Linear camera value below which white paper is too dark, so that noise affects the whole picture."""
+"""Linear value of white paper below which it is too dark, so that noise affects the whole picture."""
 CONTRAST: Final = 0.5
-"""Ratio of black ink to white paper, linear, above which there is haze, gloss, or another transfer curve."""
+"""Linear ratio of black ink to white paper above which there is haze, gloss, or another transfer function."""
 STEEPEST: Final = 33.0
-"""Largest ratio of white paper to black ink, linear, of a print on plain paper. Laser prints have 20 to 30, measured
-within a tenth (the bundled clips' has 21, measured as 19 to 23 in right set-ups). An S-shaped tone curve gives 35 to 43
-with half of smoothstep, and 84 to 103 with all of it."""
+"""Largest linear ratio of white paper to black ink of a print on plain paper. Laser prints have 20 to 30, which is
+measured within a tenth (the print of the bundled clips has 21, measured as 19 to 23 with correct settings). An S-shaped
+tone curve raises the measured ratio to 35 to 43 with half of smoothstep, and to 84 to 103 with all of it."""
 SHADOW: Final = 0.45
-"""Logarithm of the light across the card, after a smooth gradient is removed, above which there is a shadow."""
+"""Difference between the 85th and the 15th percentile of the logarithm of white cells' radiance, without its linear
+gradient across the card, above which there is a shadow."""
 BLURRED: Final = 6.0
-"""Width in pixels, from 10 to 90 %, of a printed edge above which the picture is out of focus."""
+"""Width in pixels of a printed edge, from 10 to 90 % of its height, above which the picture is out of focus."""
 SHARP: Final = 0.14
-"""Contrast per pixel of the sharpest edges, relative to the picture's contrast: 0.4 in focus, 0.08 to 0.13 with 4
-pixels of blur."""
+"""Contrast per pixel of the sharpest edges, relative to the picture's contrast, below which the picture is blurred. It
+is 0.4 in focus, and 0.08 to 0.13 with 4 pixels of blur."""
 DRIFT: Final = 0.12
 """Largest difference between frames of the logarithm of exposure."""
 TINT: Final = 0.06
-"""Change of the card's red or blue relative to green from which white balance drifts."""
+"""Largest change between frames of the logarithm of red or blue relative to green."""
 FOCAL: Final = 0.02
-"""Relative difference of the focal length that the card's perspective must exceed to contradict it; 0.015 in right
-set-ups."""
+"""Relative difference between the focal length that the card's perspective gives and the camera's, beyond which they
+contradict. With correct settings it is up to 0.015."""
 FOCAL_VIEWS: Final = 10
-"""Number of frames in which the focal length is measured."""
+"""Largest number of frames in which the focal length is measured."""
 BOARD_VIEWS: Final = 4
-"""Number of frames in which a board is searched if a single marker is expected, because a hand or the border may hide
-parts."""
+"""Largest number of frames in which a board is searched although a single marker is expected. One frame is not enough,
+because a hand or the border may hide parts of the board."""
 BOARD_MARKERS: Final = 5
-"""Number of the dictionary's markers in a picture below which no board is searched."""
+"""Smallest number of the dictionary's markers in a picture for a search for a board."""
 LEAST_END: Final = 220
-"""Smallest code for a finding on saturation. No camera's range ends lower (limited range ends at 235, shoulders above),
-but pictures that were darkened afterwards do."""
+"""Smallest saturation code (code of clipped light) for a finding. No camera's range ends lower: limited range ends at
+235, tone curves with a shoulder end above. Pictures that were darkened afterwards may end lower."""
 ALIKE_ENDS: Final = 2.0
-"""Largest difference in codes between the channels' ends: a range or shoulder is common to all three, a tint added to
-pictures later is not. Two channels must show an end. The third must agree or not clip, as blue under warm lamps."""
+"""Largest difference between the saturation codes of the channels. A range or a shoulder is common to all channels; a
+tint added to pictures later is not. At least two channels must saturate below the highest code. The third may not clip
+at all, for example blue under warm lamps."""
 LIMITED: Final = (14, 236)
-"""Lowest code at least, and highest end of the channels at most, at which limited range (16 to 235) may have been taken
-for full range, within a codec's errors."""
+"""Smallest lowest code and largest saturation code of pictures of limited range (16 to 235) that were taken for full
+range, with a margin for a codec's errors."""
 FEW: Final = 1e-3
-"""Largest share of pixels beyond the lowest or highest code, because of noise and a codec's ringing."""
+"""Largest share of pixels beyond the lowest or highest code, caused by noise and a codec's ringing."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """Frames of a scene with the poses by their marker."""
+    """Frames of a scene, with the camera's poses found by the marker."""
 
     camera: Camera
     """Camera at the frames' size."""
@@ -90,22 +92,22 @@ class Look:
     views: tuple[tuple[Image, Pose], ...]
     """Frames with a visible marker, with ``camera_from_world``."""
     errors: tuple[float, ...]
-    """Root mean square distance in pixels of the print's edges from their places by the pose, for each of ``views``."""
+    """Root mean square distance in pixels of the print's edges from their places under the pose, for each view."""
     table: NDArray[np.float32]
-    """Linear value of each code, (256, 3)."""
+    """Linear value of each 8-bit code, (256, 3)."""
 
 
 def take_look(
     scene: Scene, source: Source, frames: int, every: int = 1, tell: Callable[[str], object] | None = None
 ) -> Look:
-    """Read some of a source's first frames and track the marker; of alternating exposures, use the longest.
+    """Read some of a source's first frames and track the marker; of alternating exposures, only the longest is used.
 
     Args:
         scene: Scene with the marker and the camera.
         source: Source of the frames.
         frames: Number of frames to read.
-        every: Stride of the frames that are used.
-        tell: Function that receives a progress text for users.
+        every: Stride of the frames that are used; 1 uses every frame.
+        tell: Function to which a progress text for users is passed.
 
     Raises:
         SceneError: The camera was calibrated for another aspect ratio.
@@ -151,7 +153,7 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
         return [Finding("source.empty", "the source has no frames", "check [source]")]
     if not look.views:
         return [why_unseen(scene.marker, look)]
-    # A board's marker taken for a single one gives a wrong scale, from which all other findings follow.
+    # A board's marker that is taken for a single one gives a wrong scale, which would cause all other findings.
     views = [image for image, _ in look.views]
     if (board := board_instead(scene.marker, views[:: -(-len(views) // BOARD_VIEWS)])) is not None:
         return [board]
@@ -161,7 +163,7 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
 
 
 def _check_card(marker: Marker, look: Look) -> Iterator[Finding]:
-    """Yield findings on the marker, and on camera and light measured by it."""
+    """Yield findings on the marker, and on the camera and the light as measured on it."""
     share = len(look.views) / len(look.images)
     if share < RARE:
         text = f"the marker is seen in {share:.0%} of {len(look.images)} frames"
@@ -183,7 +185,7 @@ def _check_card(marker: Marker, look: Look) -> Iterator[Finding]:
 
 
 def _marker_twice(marker: Marker, images: Sequence[Image]) -> Finding | None:
-    """Return the finding that pictures show a marker of the scene twice, so that either may be tracked."""
+    """Return the finding that the first and the last picture show a marker of the scene twice; None if not."""
     own = set(pattern_of(marker).markers)
     detector = MarkerDetector(marker.dictionary)
     for image in (images[0], images[-1]):
@@ -202,7 +204,7 @@ def _marker_side(marker: Marker, camera: Camera, pose: Pose) -> float:
 
 
 def why_unseen(marker: Marker, look: Look) -> Finding:
-    """Return the finding on a marker that is not visible, with what the pictures show instead."""
+    """Return the finding on a marker that no frame shows, with the likely cause, such as another marker."""
     image = look.images[len(look.images) // 2]
     wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
     ids = set(pattern_of(marker).markers)
@@ -248,7 +250,7 @@ def board_instead(marker: Marker, images: Sequence[Image]) -> Finding | None:
         return None
     detector = MarkerDetector(marker.dictionary)
     for image in images:
-        # Detection with one dictionary takes milliseconds, recognising a layout tries all of them.
+        # Detection with one dictionary takes milliseconds; recognition of a layout, which tries all, takes longer.
         if len(detector.detect(_gray(image))) < BOARD_MARKERS:
             continue
         seen = recognise_board(image)
@@ -291,14 +293,18 @@ class FocalFit:
     views: int
     """Number of frames used."""
     gain: float
-    """Sum of squared residuals for the camera's focal length, relative to that of the best focal length."""
+    """Sum of squared residuals with the camera's focal length, divided by that with the best focal length."""
 
 
 def measure_focal(marker: Marker, look: Look) -> FocalFit | None:
     """Return the focal length for which the print's edges fit best, with poses fitted again for each candidate.
 
-    The squared residuals are approximated by a parabola; leaving out one frame after the other gives the standard
-    error.
+    The sum of squared residuals as a function of the focal length is approximated by a parabola. The standard error is
+    a jackknife estimate: the fit is repeated without each of the frames.
+
+    Args:
+        marker: The printed card.
+        look: Frames with the marker.
 
     Returns:
         The fit; None if fewer than four frames can be used.
@@ -326,7 +332,7 @@ def measure_focal(marker: Marker, look: Look) -> FocalFit | None:
 
 def _check_focal(marker: Marker, look: Look) -> Iterator[Finding]:
     fit = measure_focal(marker, look)
-    # With views from one side only, the minimum is too flat.
+    # If all views are from one side, the minimum is too flat for a conclusion.
     if fit is None or abs(fit.ratio - 1) < max(FOCAL, 3 * fit.deviation) or fit.gain < 1.02:
         return
     given = look.camera.fx
@@ -340,23 +346,36 @@ def _check_focal(marker: Marker, look: Look) -> Iterator[Finding]:
 def _squared_errors(
     marker: Marker, camera: Camera, pictures: Sequence[tuple[Image, list[Detection]]], factor: float
 ) -> Array:
-    """Return the mean squared distance of the print's edges in each picture, pixels squared.
+    """Return the mean squared distance in pixels of the print's edges from their places under a fitted pose, (n,).
 
-    Infinite if not visible.
+    It is infinite for pictures in which no pose fits.
+
+    Args:
+        marker: The printed card.
+        camera: Camera of the pictures.
+        pictures: Pictures with the markers detected in them.
+        factor: Factor on the camera's focal length.
     """
     tracker = Tracker(marker, dataclasses.replace(camera, fx=camera.fx * factor, fy=camera.fy * factor), steady=False)
     return np.array([tracker.error_of(image, found) ** 2 for image, found in pictures])
 
 
 def _lowest(factors: Array, totals: Array) -> float:
-    """Return the minimum of the parabola through the totals."""
+    """Return the factor with the smallest total, from a parabola fitted to the totals; clamped to the tried range."""
     curve, slope, _ = np.polyfit(factors, totals, 2)
     lowest = -slope / (2 * curve) if curve > 0 else factors[np.argmin(totals)]
     return float(np.clip(lowest, factors[0], factors[-1]))
 
 
 def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[Array, Array, Array]:
-    """Return white cells' positions (n, 3) and codes (n, 3), and black cells' codes (m, 3), of cells in the picture."""
+    """Return positions (n, 3) and codes (n, 3) of the print's white cells in a picture, and codes (m, 3) of black ones.
+
+    Args:
+        marker: The printed card.
+        look: Frames, with their camera.
+        image: The picture.
+        pose: ``camera_from_world``.
+    """
     cells, white, _, _ = printed_cells(marker)
     pixels = project(look.camera, pose.apply(cells))
     inside = ((pixels >= 1) & (pixels <= (look.camera.width - 2, look.camera.height - 2))).all(1)
@@ -366,7 +385,7 @@ def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[
 
 
 def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> Iterator[Finding]:
-    """Yield findings on the card's white (clipped, dark, shadowed) and on its drift."""
+    """Yield findings on the card's paper (clipped, dark, in a shadow), its contrast and its drift over frames."""
     clipped, dark, ratios, uneven, whites = [], [], [], [], []
     for image, pose in views:
         places, white, black = _cell_values(marker, look, image, pose)
@@ -382,7 +401,7 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
         log = np.log(np.maximum(linear.mean(1), 1e-4))
         design = np.column_stack([np.ones(len(places)), places[:, :2]])
         rest = log - design @ np.linalg.lstsq(design, log, rcond=None)[0]
-        # A shadow's edge splits the cells into two groups; cells darkened by print noise or blurred edges are few.
+        # A shadow darkens many of the cells. Cells that are dark by noise of the print or blurred edges are few.
         uneven.append(float(np.percentile(rest, 85) - np.percentile(rest, 15)))
     if not whites:
         return
@@ -411,7 +430,15 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
 
 
 def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array) -> Iterator[Finding]:
-    """Yield findings on drift: the camera changes the whole picture equally, a lamp changes each side differently."""
+    """Yield findings on drift of exposure or white balance, which changes the whole picture by one factor.
+
+    A lamp changes surfaces by different factors.
+
+    Args:
+        look: Frames of the scene.
+        views: The frames that are compared, the first and the last.
+        whites: Median linear value of the card's paper in each frame that shows enough of it, (n, 3).
+    """
     if len(whites) < 2:
         return
     first, last = views[0][0], views[-1][0]
@@ -439,7 +466,7 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
 
 
 def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> Iterator[Finding]:
-    """Yield the finding on the width of printed edges in the picture."""
+    """Yield a finding if printed edges are too wide in the pictures."""
     pattern, widths = pattern_of(marker), []
     taps = np.linspace(-8, 8, 65)
     for image, pose in views:
@@ -467,7 +494,7 @@ def _rise(profile: Array, taps: Any) -> float:
 
 
 def check_saturation(scene: Scene, look: Look) -> list[Finding]:
-    """Return the finding that clipped light in a mirror ball has codes below the highest one.
+    """Return a finding if clipped light in the mirror balls has a code below 255.
 
     Nothing is found if no ball shows clipped light.
 

@@ -1,9 +1,9 @@
 """Check of the printed card's scale by the paper around it, whose size is known.
 
-A print at 97 % looks the same as everything else at 103 %: the print itself cannot show the error, but the paper can.
-In units of the print, A4 at 97 % is 216 mm wide, which is nearly the width of Letter. However, its upper edge is 179 mm
-from the board's centre, unlike Letter's. The left, right and upper edges of the sheet are therefore searched near their
-expected places, along lines across the margin.
+If the card is printed at 97 %, everything else appears 3 % larger: the print itself cannot show the error, but the
+paper can. In units of the print, an A4 sheet printed at 97 % is 216 mm wide, which is nearly the width of Letter.
+However, its upper edge is 179 mm from the board's centre, unlike Letter's. The left, right and upper edges of the sheet
+are therefore searched near their expected places, along lines across the margin.
 """
 
 from __future__ import annotations
@@ -24,23 +24,24 @@ from warp_ar.tracking.card_layout import CARD_MARKER, board_top
 Image = NDArray[np.uint8]
 
 OFF: Final = 0.012
-"""Largest relative error of a print's scale; printers feed paper with as much error."""
+"""Largest relative error of a print's scale. Printers cause as much by the feeding of paper."""
 SIDES: Final = (0.096, 0.122)
-"""Range of distances in metres from the board's centre of the left and right edge of A4 or Letter, at 90 to 110 %."""
+"""Range in metres of the distance from the board's centre to the left or right edge of A4 or Letter, printed at 90 to
+110 %."""
 UPPER: Final = (0.158, 0.200)
-"""Range of distances in metres of the upper edge."""
+"""Range in metres of the distance from the board's centre to the upper edge."""
 STEP: Final = 0.0005
 """Distance in metres between samples across an edge."""
 LINES: Final = 24
-"""Number of lines across each edge."""
+"""Number of lines across each edge, along which it is searched."""
 DARKER: Final = 14.0
-"""Smallest difference in codes between the paper and its surroundings."""
+"""Smallest difference in 8-bit codes between the paper and its surroundings."""
 ALIKE: Final = 0.0012
-"""Largest spread in metres of the lines across one edge."""
+"""Largest difference in metres between the edge on a line and the median over the lines, for the line to agree."""
 AGREE: Final = 0.5
 """Share of the lines that must agree."""
 SAME: Final = 0.003
-"""Largest error in metres of the upper edge for a paper and a scale."""
+"""Largest difference in metres between the upper edge that is found and that of a paper of the width that is found."""
 FEWEST: Final = 2
 """Smallest number of views that show the sheet."""
 
@@ -58,7 +59,13 @@ def card_scale(marker: Marker) -> float | None:
 
 
 def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pose]]) -> list[Finding]:
-    """Return a finding if the paper contradicts the scale of the marker's lengths."""
+    """Return a finding if the paper contradicts the scale of the marker's lengths.
+
+    Args:
+        marker: The scene's marker.
+        camera: Camera of the pictures.
+        views: Pictures with ``camera_from_world``.
+    """
     told = card_scale(marker)
     if told is None:
         return []
@@ -69,9 +76,9 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
     best: tuple[float, float, str] | None = None
     for paper in ("a4", "letter"):
         paper_width, height = (length / 1e3 for length in PAPERS[paper])
-        # Scene metres per world metre: with a larger print, scene metres are too short.
+        # True metres per metre in the scene: above 1 if the print is larger than the scene states.
         factor = paper_width / width
-        # Printers scale about the centre of the page.
+        # Printers scale a page about its centre.
         printed = factor * told
         top = (height / 2 - printed * (height / 2 - board_top(height))) / factor
         if best is None or abs(top - upper) < best[0]:
@@ -94,10 +101,13 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
 
 
 def _find_sheet(image: Image, camera: Camera, pose: Pose) -> tuple[float, float] | None:
-    """Return the sheet's width and its upper edge's distance from the board's centre, metres; None if not visible."""
+    """Return the sheet's width and the distance of its upper edge from the board's centre, in the scene's metres.
+
+    The result is None if one of the edges is not found.
+    """
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
     along = np.linspace(-0.05, 0.15, LINES)
-    # Not where the ball or its background may be.
+    # The middle of the upper edge is left out, because the ball may hide it.
     beside = np.concatenate([np.linspace(-0.09, -0.05, LINES // 2), np.linspace(0.05, 0.09, LINES // 2)])
     sides = [_find_edge(gray, camera, pose, SIDES, [((sign, 0.0), (0.0, y)) for y in along]) for sign in (-1.0, 1.0)]
     upper = _find_edge(gray, camera, pose, UPPER, [((0.0, 1.0), (x, 0.0)) for x in beside])
@@ -113,7 +123,15 @@ def _find_edge(
     window: tuple[float, float],
     lines: Sequence[tuple[tuple[float, float], tuple[float, float]]],
 ) -> float | None:
-    """Return the distance to the paper's edge along lines, each with direction and start; None if they disagree."""
+    """Return the distance in metres from the board's centre to an edge of the paper; None if the lines disagree.
+
+    Args:
+        gray: The picture in grey.
+        camera: Camera of the picture.
+        pose: ``camera_from_world``.
+        window: Range of distances in metres in which the edge is searched.
+        lines: Lines along which the edge is searched, each with direction and start in the board's plane.
+    """
     far = np.arange(*window, STEP)
     found = []
     for way, start in lines:
@@ -122,7 +140,7 @@ def _find_edge(
         if not ((pixels >= 1) & (pixels <= (gray.shape[1] - 2, gray.shape[0] - 2))).all():
             continue
         values = cv2.remap(gray, pixels.astype(np.float32)[:, None], None, cv2.INTER_LINEAR).ravel()
-        # The paper is bright up to its edge, and its surroundings are not.
+        # The paper must be bright up to its edge, and its surroundings darker.
         falls = values[:-4] - values[4:]
         k = int(falls.argmax())
         if falls[k] < DARKER or values[: k + 1].min() < values[k + 4] + 0.5 * DARKER:

@@ -1,8 +1,8 @@
 """Check of modelled walls and boxes against edges in the picture.
 
-Every visible edge of a shape is sampled; a sample matches if the picture has a colour step across the edge there. A
-shape with few matches is also tested at displaced positions. If many more samples match at one of them, the shape
-stands there.
+Samples are taken along every visible edge of a shape. A sample matches if the colour of the picture changes abruptly
+across the edge there. A shape with few matches is also tested at displaced positions. If many more samples match at one
+of them, the shape is reported to be there.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ Array = NDArray[np.float64]
 FARTHEST: Final = 0.03
 """Largest displacement in metres, along x and y."""
 STEPS: Final = (0.003, 0.001)
-"""Distances in metres between displacements, first around the shape and then around the best one."""
+"""Distances in metres between tested displacements, first around the shape and then around the best displacement."""
 PIXELS: Final = 5.0
-"""Smallest displacement of a corner in pixels for a finding; a right box has 0.6."""
+"""Smallest displacement of a corner in pixels for a finding; for a box at the right place it is 0.6."""
 ON: Final = 0.6
-"""Share of matching samples from which a shape is right."""
+"""Share of matching samples from which a shape counts as right."""
 BETTER: Final = 0.15
 """Smallest increase of the share of matching samples at a displaced position."""
 FEWEST: Final = 2
-"""Number of views that must agree, or all if there are fewer."""
+"""Smallest number of views in which the shape fits only elsewhere, for a finding; all views if there are fewer."""
 STEP: Final = 6.0
-"""Smallest colour step in codes per pixel, above noise and wood grain; lower in dark pictures."""
+"""Smallest slope of the colour across an edge in 8-bit codes per pixel, above noise and wood grain. It is lower in dark
+pictures."""
 BRIGHT: Final = 110.0
 """Mean code of a picture from which ``STEP`` applies."""
 FAINTEST: Final = 2.0
-"""Smallest colour step in codes per pixel in the darkest picture: four standard deviations of a camera's noise."""
+"""Smallest slope in codes per pixel in the darkest picture: four standard deviations of a camera's noise."""
 _FACES: Final = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 
 
@@ -67,7 +68,10 @@ def check_proxies(scene: Scene, camera: Camera, views: Sequence[tuple[Image, Pos
 
 
 def _numbers(proxy: Proxy) -> tuple[str | None, Array]:
-    """Return kind and numbers, in the form of ``corners_of``, of a wall or of a box standing on the receiver."""
+    """Return the kind and the numbers of a wall or box that stands on the receiver, as ``corners_of`` takes them.
+
+    The kind is None for any other shape.
+    """
     turn = math.radians(proxy.rotate[2])
     x, y, z = proxy.at
     if proxy.shape == "box" and proxy.rotate[:2] == (0.0, 0.0) and abs(z - proxy.size[2] / 2) < 0.1 * proxy.size[2]:
@@ -80,9 +84,16 @@ def _numbers(proxy: Proxy) -> tuple[str | None, Array]:
 def _elsewhere(
     image: Image, camera: Camera, pose: Pose, kind: str, shape: Array
 ) -> tuple[tuple[float, float], bool] | None:
-    """Return the displacement in metres with the most matches, and True if the shape fits only there.
+    """Return the displacement, x and y in metres, with the most matches, and True if the shape fits only there.
 
-    None if the shape is not entirely in the picture, because a cut-off outline fits anywhere.
+    The result is None if the shape is not entirely in the picture, because the rest of an outline would fit anywhere.
+
+    Args:
+        image: The picture.
+        camera: Its camera.
+        pose: ``camera_from_world``.
+        kind: ``wall`` or ``box``.
+        shape: Numbers of the shape, as ``corners_of`` takes them.
     """
     corners = corners_of(kind, shape)
     eye = -pose.rotation.T @ pose.translation
@@ -112,7 +123,13 @@ def _elsewhere(
 
 
 def _edges(kind: str, corners: Array, eye: Array) -> list[tuple[int, int]]:
-    """Return the edges visible to the camera: those of faces turned toward it."""
+    """Return the edges of faces that are turned toward the camera, as pairs of indices of corners.
+
+    Args:
+        kind: ``wall`` or ``box``.
+        corners: Corners of the shape in the world.
+        eye: Position of the camera in the world.
+    """
     faces = [(0, 1, 2, 3)]
     if kind == "box":
         middle, centers = corners.mean(0), [corners[list(face)].mean(0) for face in _FACES]
@@ -123,16 +140,16 @@ def _edges(kind: str, corners: Array, eye: Array) -> list[tuple[int, int]]:
 
 
 class _Steps:
-    """Colour steps of a picture."""
+    """Slopes of the colour in a picture."""
 
     def __init__(self, image: Image) -> None:
         smooth = cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32)
-        # Scharr's kernel has a weight of 32 per code and pixel.
+        # Scharr's kernel gives 32 for a slope of one code per pixel.
         self._slopes = [cv2.Scharr(smooth, cv2.CV_32F, *axes) / 32.0 for axes in ((1, 0), (0, 1))]
         self._least = max(STEP * min(float(image.mean()) / BRIGHT, 1.0), FAINTEST)
 
     def share(self, start: Array, end: Array) -> float:
-        """Return the share of a straight edge between two pixels across which the picture has a colour step."""
+        """Return the share of the samples along a line between two pixels across which the colour has a steep slope."""
         length = float(np.linalg.norm(end - start))
         if not length > 0.0:
             return 0.0

@@ -24,13 +24,13 @@ SMALLEST_CARD: Final = 0.008
 FARTHEST: Final = 5.0
 """Largest distance in metres from the card."""
 FIELDS: Final = (12.0, 140.0)
-"""Range in degrees of horizontal fields of view of pinhole cameras."""
+"""Range of plausible horizontal fields of view of a pinhole camera, degrees."""
 SQUARE: Final = 0.02
 """Largest relative difference of a pixel's sides."""
 CENTRAL: Final = 0.15
 """Largest distance of the principal point from the picture's centre, relative to the width."""
 SUNK: Final = 0.0015
-"""Depth in metres by which a ball may be below the table: the card's thickness and a ruler's error."""
+"""Largest depth in metres of a ball's lowest point below the table: the card's thickness and a ruler's error."""
 
 
 def check_scene(scene: Scene) -> list[Finding]:
@@ -63,7 +63,12 @@ def _check_items(scene: Scene) -> Iterator[Finding]:
 
 
 def _in_metres(value: float, largest: float) -> str:
-    """Return a guess at the intended unit, as text."""
+    """Return a phrase that guesses the intended unit of a value; empty if no unit is plausible.
+
+    Args:
+        value: Length that the scene states in metres.
+        largest: Largest plausible length in metres.
+    """
     for name, factor in (("centimetres", 0.01), ("millimetres", 0.001)):
         if value * factor <= largest:
             return f"; {value:g} {name} are {value * factor:g} m"

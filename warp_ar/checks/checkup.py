@@ -20,22 +20,28 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.sources.sources import open_source, source_of
 
 FRAMES: Final = 120
-"""Number of frames read by the full check."""
+"""Number of frames that the full check reads."""
 FEW_VIEWS: Final = 5
-"""Number of views in which paper and modelled shapes are searched."""
+"""Largest number of frames in which paper and modelled shapes are searched."""
 QUICK_FRAMES: Final = 12
-"""Number of frames read by the quick check."""
+"""Number of frames that the quick check uses."""
 SPREAD: Final = 96
-"""Number of frames, at the size ``PIXELS``, over which the quick check's frames are spread, to include drift and
-several views."""
+"""Number of frames over which the quick check's frames are spread, to include drift and several views. Of pictures with
+more than ``PIXELS`` pixels, fewer frames are read, so that the total number of pixels stays equal."""
 _NOT_LOOKED: Final = ("source.", "units.", "marker.", "picture.", "camera.aspect", "ball.unfound", "ball.outside")
-"""Prefixes of findings after which a ball was not searched, or after which one of several balls was not visible."""
+"""Prefixes of the names of findings with which a ball was not searched, or one of several balls was not visible."""
 PIXELS: Final = 640 * 480
-"""Number of pixels of a picture above which fewer frames are read, for the same total."""
+"""Number of pixels of a picture up to which ``SPREAD`` applies."""
 
 
 def check_up(scene: Scene, source: str | int | Path | None, *, quick: bool = False) -> list[Finding]:
-    """Return the findings on a set-up, the worst first; arguments are those of `check_and_look`."""
+    """Return the findings on a set-up, the worst first.
+
+    Args:
+        scene: The scene.
+        source: Source of the frames; None: check the scene's numbers only.
+        quick: True to read only a few frames, which takes about a second.
+    """
     return check_and_look(scene, source, quick=quick)[0]
 
 
@@ -47,7 +53,7 @@ def quick_check(scene: Scene, given: str | int | Path | None) -> tuple[list[Find
         given: Source of frames instead of the scene's own, or None.
 
     Returns:
-        The findings, the worst first, and True if a frame shows every mirror ball of the scene, which has one.
+        The findings, the worst first; and True if the scene has mirror balls and the frames show all of them.
     """
     source = source_of(scene, given)
     recorded = isinstance(source, Path) or (isinstance(source, str) and Path(source).exists())
@@ -71,7 +77,7 @@ def check_and_look(
         source: Source of the frames; None: check the scene's numbers only.
         frames: Number of frames to read.
         quick: True to read only a few frames, which takes about a second.
-        tell: Function that receives a progress text for users; the full check takes seconds.
+        tell: Function to which a progress text for users is passed; the full check takes seconds.
 
     Returns:
         The findings, and the frames or None if none were read.
@@ -92,7 +98,14 @@ def check_and_look(
 
 
 def _read(scene: Scene, source: str | int | Path, frames: int | None, tell: Callable[[str], object] | None) -> Look:
-    """Return frames of a source; for ``frames`` None, as many as can be read in a second, spread over its beginning."""
+    """Return frames of a source, with the marker tracked in them.
+
+    Args:
+        scene: The scene.
+        source: Source of the frames.
+        frames: Number of frames to read; None: those of the quick check, which are read in a second.
+        tell: Function to which a progress text for users is passed, or None.
+    """
     own = scene.source
     exposures = own.exposures or () if own is not None else ()
     with open_source(source, exposures=exposures) as opened:
@@ -111,30 +124,37 @@ def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
     Args:
         scene: The scene.
         look: Frames of the scene.
-        views: Number of frames in which the ball is searched; each takes about half a second.
+        views: Largest number of frames in which each ball is searched; each takes about half a second.
     """
     before = check_scene(scene)
     return worst_first([*before, *_check_frames(scene, look, views, {finding.name for finding in before})])
 
 
 def _check_frames(scene: Scene, look: Look, views: int, told: set[str]) -> list[Finding]:
-    """Return the findings by frames, without those that the scene's own numbers have given."""
+    """Return the findings that frames show, except where the scene's numbers explain them already.
+
+    Args:
+        scene: The scene.
+        look: Frames of the scene.
+        views: Largest number of frames in which each ball is searched.
+        told: Names of the findings on the scene's numbers.
+    """
     if not scene.has_marker and look.images:
-        # The poses are given: without a print, camera, light and ball cannot be checked.
+        # The scene gives the poses. Without a print, camera, light and ball cannot be checked.
         return check_objects(scene, look.camera, written_poses(scene))
     found = check_pictures(scene, look)
     if any(finding.name in ("marker.board", "marker.twice") for finding in found):
-        return found  # poses by another marker allow no conclusion on prints, proxies and balls
+        return found  # poses by a wrong marker allow no conclusion on print, proxies and balls
     few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
     found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
-    # Where the scene's numbers are impossible, pictures add no information.
+    # If the scene's numbers are impossible, pictures add no information.
     if any(name.startswith("units.") for name in told):
         return found
     found += check_objects(scene, look.camera, [pose for _, pose in look.views])
     balls = check_balls(scene, look, views)
     if not any(finding.name in ("ball.outside", "ball.unfound") for finding in balls):
         found += check_saturation(scene, look)
-    # The mirror image is darker than the direct view: another curve changes their ratio.
+    # The mirror image is darker than the direct view, so a wrong tone curve changes their ratio.
     known = {"ball.reflectance"} if {"camera.response", "card.contrast"} & {one.name for one in found} else set()
     known |= {"ball.place"} if "ball.sunk" in told else set()
     return [*found, *(finding for finding in balls if finding.name not in known)]
@@ -146,8 +166,8 @@ def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]
     for probe in scene.probes:
         ground = standing_ground(probe, scene.proxies)
         if ground is not None and ground_is_seen(views, camera, probe, ground):
-            continue  # edges of the visible surface may resemble a rim
-        # Frames are tested up to the first success: each takes a third of a second.
+            continue  # the surface is visible in the ball's place; its edges may resemble a rim
+        # Frames are tested only up to the first that shows the ball; each takes a third of a second.
         outlines = (find_outline(view, camera, probe) for view in views)
         if any(outline is not None and outline.support > LOST for outline in outlines):
             return True

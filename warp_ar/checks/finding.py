@@ -11,10 +11,10 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Fault of a set-up, or an assumed value."""
+    """Fault of a set-up, or a value that is only assumed."""
 
     name: str
-    """Name of the check, such as ``probe.radius``."""
+    """Name of the check, such as ``ball.radius``."""
     text: str
     """Description of the fault, with the value and allowed values."""
     remedy: str
@@ -30,12 +30,15 @@ class Finding:
 
     @property
     def error(self) -> float:
-        """Mean FLIP between pictures lit with and without this fault, 0 to 1; 1 if lighting is impossible."""
+        """Mean FLIP between pictures lit with and without this fault, 0 to 1.
+
+        It is 1 if the fault makes lighting impossible, and 0 if it was not measured.
+        """
         return float(fault_errors().get(self.name, {"error": 0.0})["error"])
 
     @property
     def cost(self) -> str:
-        """Return the effect of the fault, as text."""
+        """Effect of the fault on the picture, as text."""
         entry = fault_errors().get(self.name)
         if entry is None:
             return "not measured"
@@ -46,7 +49,7 @@ class Finding:
 
 @functools.cache
 def fault_errors() -> dict[str, Any]:
-    """Return the table of simulated faults: by the check's name, the fault and its error."""
+    """Return the table of simulated faults: by the name of a check, the ``fault`` and its ``error`` in FLIP."""
     text = importlib.resources.files("warp_ar.checks").joinpath("fault_errors.json").read_text(encoding="utf-8")
     return dict(json.loads(text))
 

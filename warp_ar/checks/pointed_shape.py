@@ -1,4 +1,4 @@
-"""Planes, walls and boxes from four points that a user selects in one picture; no edges are detected."""
+"""Planes, walls and boxes from four points that a user selects in one picture, without detection of edges."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ SMALLEST: Final = 0.004
 LARGEST: Final = 3.0
 """Longest side of a shape and its largest distance from the marker, metres."""
 SQUARE: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+"""Corners of a unit square around the origin."""
 _ORDER: Final = {
     "plane": "its four corners, around it",
     "wall": "the left and right end of its foot, then its top right and top left corner",
@@ -33,10 +34,11 @@ def point_out(camera: Camera, pose: Pose, kind: str, points: Sequence[tuple[floa
     Args:
         camera: Camera of the picture.
         pose: ``camera_from_world``.
-        kind: ``plane``: corners of a rectangle on the receiver, in order; ``wall``: the left and right end of its foot,
-            then its top right and top left corner; ``box``: the ends of an edge of its base, then the corner of its top
-            above the second, then the next corner of its top, behind: all four are seen.
-        points: Pixels.
+        kind: ``plane``, ``wall`` or ``box``.
+        points: Four pixels. For a plane: the corners of a rectangle on the receiver, in order. For a wall: the left and
+            the right end of its foot, then its top right and top left corner. For a box: both ends of an edge of its
+            base, then the corner of its top above the second end, then the next corner of its top, which is further
+            back.
 
     Raises:
         UsageError: The points outline no such shape.
@@ -68,11 +70,11 @@ def point_out(camera: Camera, pose: Pose, kind: str, points: Sequence[tuple[floa
 
 
 def corners_of(kind: str, shape: Array) -> Array:
-    """Return a shape's corners in the world: four, or a box's base and then its top.
+    """Return a shape's corners in the world, (4, 3) metres; of a box those of its base, then those of its top, (8, 3).
 
     Args:
         kind: ``plane``, ``wall`` or ``box``.
-        shape: x, y, angle about the vertical in radians, then two or three sides.
+        shape: x and y of the middle in metres, angle about the vertical in radians, and two or three sides in metres.
     """
     x, y, angle, width, second = shape[:5]
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
@@ -84,7 +86,16 @@ def corners_of(kind: str, shape: Array) -> Array:
 
 
 def _at_height(eye: Array, rays: Array, height: float = 0.0) -> Array:
-    """Return the intersections of rays with the receiver's plane, or a level above it, (n, 2)."""
+    """Return the intersections of rays with a horizontal plane, (n, 2) metres.
+
+    Args:
+        eye: Common origin of the rays in the world.
+        rays: Directions of the rays, (n, 3).
+        height: Height of the plane above the receiver, metres.
+
+    Raises:
+        UsageError: A ray does not reach the plane.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         far = (height - eye[2]) / rays[:, 2]
     if not (np.isfinite(far) & (far > 0)).all():
@@ -93,9 +104,9 @@ def _at_height(eye: Array, rays: Array, height: float = 0.0) -> Array:
 
 
 def _start(kind: str, eye: Array, rays: Array) -> Array:
-    """Return initial numbers in the form of ``corners_of``.
+    """Return initial numbers of a shape, as ``corners_of`` takes them, from the rays through the selected points.
 
-    Two points end an edge; the others are above it and behind it.
+    The first two points are the ends of an edge on the receiver. The others are above or behind it.
     """
     a, b = _at_height(eye, rays if kind == "plane" else rays[:2])[:2]
     along, middle = b - a, (a + b) / 2
@@ -104,7 +115,7 @@ def _start(kind: str, eye: Array, rays: Array) -> Array:
         raise UsageError(f"two of the points are at one place; expected {_ORDER[kind]}")
     start = [math.atan2(along[1], along[0]), width]
     if kind != "plane":
-        # Height at which the third point's ray passes the vertical through the second point.
+        # Height at which the ray through the third point is closest to the vertical line through the second point.
         above = rays[2]
         far = float(above[:2] @ (b - eye[:2])) / max(float(above[:2] @ above[:2]), 1e-12)
         height = float(eye[2] + far * above[2])
@@ -131,6 +142,6 @@ def _proxy(kind: str, shape: Array) -> Proxy:
     if kind == "plane":
         return Proxy("plane", at=(x, y, 0.0), rotate=(0.0, 0.0, turn), size=sides)
     if kind == "wall":
-        # A plane faces its own +z; rotated upright about x, it faces -y.
+        # A plane faces +z of its own frame; rotated upright about x, it faces -y.
         return Proxy("plane", at=(x, y, round(sides[1] / 2, 5)), rotate=(90.0, 0.0, turn), size=sides)
     return Proxy("box", at=(x, y, round(sides[2] / 2, 5)), rotate=(0.0, 0.0, turn), size=sides)
