@@ -10,9 +10,9 @@ a radiant intensity I.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,7 @@ SUN_DEGREES = 0.53
 """Angular diameter of a directional light in degrees: the sun's."""
 _COORDINATES = ("st", "st1")
 """Names of the two sets of texture coordinates."""
+RGBA: TypeAlias = tuple[float, float, float, float]
 _TENTHS = 10.0
 """Factor on a USD camera's lens lengths, whose unit is a tenth of the stage's unit."""
 
@@ -208,9 +209,6 @@ class _Material:
 
     def __init__(self, pxr: Any, stage: Any, where: str, material: ExchangeMaterial, files: dict[str, Path]) -> None:
         self._pxr, self._stage, self._where, self._material, self._files = pxr, stage, where, material, files
-        self._types = {"diffuseColor": "Color3f", "emissiveColor": "Color3f", "specularColor": "Color3f"}
-        self._types |= {"normal": "Normal3f", "useSpecularWorkflow": "Int"}
-        self._surface = self._shader("surface", "UsdPreviewSurface")
 
     def write(self, *, colored: bool) -> Any:
         """Return the material.
@@ -218,97 +216,85 @@ class _Material:
         With ``colored``, the mesh's ``displayColor`` is the base colour if there is no picture.
         """
         material, own, files = self._material, self._material.own, self._files
+        inputs: dict[str, tuple[str, Any]] = {}
+        color, emission, opacity = material.base_color, own.emission, own.opacity
+        roughness, metallic = material.roughness, material.metallic
         if material.specular is not None:
-            self._set("useSpecularWorkflow", 1)
-            self._set("specularColor", self._pxr.Gf.Vec3f(*material.specular))
-        # An unlit material has neither reflection nor diffuse light.
-        shown = "emissiveColor" if own.unlit else "diffuseColor"
-        if own.unlit:
-            self._set("diffuseColor", self._pxr.Gf.Vec3f(0.0))
+            inputs |= {"useSpecularWorkflow": ("Int", 1), "specularColor": ("Color3f", material.specular)}
         if "" in files:
-            self._read("", {shown: "rgb"}, (*material.base_color, own.opacity), space="sRGB")
+            channel = self._read("", (*material.base_color, own.opacity), space="sRGB")
+            color, opacity = channel("rgb"), channel("a")
         elif colored:
-            reader = self._shader("colors", "UsdPrimvarReader_float3")
-            reader.CreateInput("varname", self._pxr.Sdf.ValueTypeNames.String).Set("displayColor")
-            self._connect(shown, reader, "result", "Float3")
-        else:
-            self._set(shown, self._pxr.Gf.Vec3f(*material.base_color))
+            reader = self._shader("colors", "UsdPrimvarReader_float3", {"varname": ("String", "displayColor")})
+            color = reader.CreateOutput("result", self._pxr.Sdf.ValueTypeNames.Float3)
         if "emission" in files and not own.unlit:
-            self._read("emission", {"emissiveColor": "rgb"}, (*own.emission, 1.0), space="sRGB")
-        elif any(own.emission) and not own.unlit:
-            self._set("emissiveColor", self._pxr.Gf.Vec3f(*own.emission))
+            emission = self._read("emission", (*own.emission, 1.0), space="sRGB")("rgb")
+        # An unlit material has neither reflection nor diffuse light.
+        color, emission = ((0.0, 0.0, 0.0), color) if own.unlit else (color, emission)
+        inputs |= {"diffuseColor": ("Color3f", color), "emissiveColor": ("Color3f", emission)}
         if "metallic_roughness" in files:
-            factors = (1.0, material.roughness, material.metallic, 1.0)
-            self._read("metallic_roughness", {"roughness": "g", "metallic": "b"}, factors)
-        else:
-            self._set("roughness", material.roughness)
-            self._set("metallic", material.metallic)
+            channel = self._read("metallic_roughness", (1.0, roughness, metallic, 1.0))
+            roughness, metallic = channel("g"), channel("b")
+        inputs |= {"roughness": ("Float", roughness), "metallic": ("Float", metallic)}
         if "normal" in files:
             s = own.normal_scale
-            self._read("normal", {"normal": "rgb"}, (2.0 * s, 2.0 * s, 2.0, 1.0), (-s, -s, -1.0, 0.0))
+            normal = self._read("normal", (2.0 * s, 2.0 * s, 2.0, 1.0), (-s, -s, -1.0, 0.0))
+            inputs["normal"] = "Normal3f", normal("rgb")
         if "occlusion" in files:
             s = own.occlusion_strength
-            self._read("occlusion", {"occlusion": "r"}, (s, s, s, 1.0), (1.0 - s, 1.0 - s, 1.0 - s, 0.0))
-        if own.alpha != "opaque" and "" in files:
-            texture = self._pxr.UsdShade.Shader.Get(self._stage, f"{self._where}/texture")
-            self._connect("opacity", texture, "a", "Float")
-        elif own.alpha != "opaque":
-            self._set("opacity", own.opacity)
+            inputs["occlusion"] = (
+                "Float",
+                self._read("occlusion", (s, s, s, 1.0), (1.0 - s, 1.0 - s, 1.0 - s, 0.0))("r"),
+            )
+        if own.alpha != "opaque":
+            inputs["opacity"] = "Float", opacity
         if own.alpha == "mask":
-            self._set("opacityThreshold", own.cutoff)
+            inputs["opacityThreshold"] = "Float", own.cutoff
         made = self._pxr.UsdShade.Material.Define(self._stage, self._where)
-        made.CreateSurfaceOutput().ConnectToSource(self._surface.ConnectableAPI(), "surface")
+        surface = self._shader("surface", "UsdPreviewSurface", inputs)
+        made.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
         return made
 
-    def _shader(self, name: str, kind: str) -> Any:
+    def _shader(self, name: str, kind: str, inputs: Mapping[str, tuple[str, Any]]) -> Any:
+        """Return a shader; each input has a type, and a value or another shader's output."""
         shader = self._pxr.UsdShade.Shader.Define(self._stage, f"{self._where}/{name}")
         shader.CreateIdAttr(kind)
+        for key, (form, value) in inputs.items():
+            made = shader.CreateInput(key, getattr(self._pxr.Sdf.ValueTypeNames, form))
+            if isinstance(value, self._pxr.UsdShade.Output):
+                made.ConnectToSource(value)
+            else:
+                made.Set(value)
         return shader
 
-    def _input(self, name: str) -> Any:
-        kind = getattr(self._pxr.Sdf.ValueTypeNames, self._types.get(name, "Float"))
-        return self._surface.CreateInput(name, kind)
-
-    def _set(self, name: str, value: Any) -> None:
-        self._input(name).Set(value)
-
-    def _connect(self, name: str, shader: Any, output: str, kind: str) -> None:
-        self._input(name).ConnectToSource(shader.CreateOutput(output, getattr(self._pxr.Sdf.ValueTypeNames, kind)))
-
     def _read(
-        self,
-        kind: str,
-        entries: dict[str, str],
-        scale: Sequence[float],
-        bias: Sequence[float] | None = None,
-        space: str = "raw",
-    ) -> None:
-        """Connect inputs to a picture's channels at its texture coordinates, times ``scale`` plus ``bias``."""
-        picture, names, gf = self._material.pictures[kind], self._pxr.Sdf.ValueTypeNames, self._pxr.Gf
-        name = kind or "texture"
-        texture = self._shader(name, "UsdUVTexture")
-        texture.CreateInput("file", names.Asset).Set(f"./{self._files[kind].name}")
-        texture.CreateInput("sourceColorSpace", names.Token).Set(space)
-        texture.CreateInput("scale", names.Float4).Set(gf.Vec4f(*scale))
-        if bias is not None:
-            texture.CreateInput("bias", names.Float4).Set(gf.Vec4f(*bias))
-        for entry, wrap in zip(("wrapS", "wrapT"), picture.use.wrap, strict=True):
-            texture.CreateInput(entry, names.Token).Set(wrap)
-        coordinates = _COORDINATES[picture.use.uv_set]
-        reader = self._shader(coordinates, "UsdPrimvarReader_float2")
-        reader.CreateInput("varname", names.String).Set(coordinates)
+        self, kind: str, scale: RGBA, bias: RGBA = (0.0, 0.0, 0.0, 0.0), space: str = "raw"
+    ) -> Callable[[str], Any]:
+        """Return the outputs, by channel, of a picture at its texture coordinates, times ``scale`` plus ``bias``."""
+        picture, names = self._material.pictures[kind], self._pxr.Sdf.ValueTypeNames
+        name, coordinates = kind or "texture", _COORDINATES[picture.use.uv_set]
+        reader = self._shader(coordinates, "UsdPrimvarReader_float2", {"varname": ("String", coordinates)})
         source = reader.CreateOutput("result", names.Float2)
         if picture.use.transform != IDENTITY:
             across, up, turn, c, f = picture.placing
-            place = self._shader(f"{name}_place", "UsdTransform2d")
-            place.CreateInput("in", names.Float2).ConnectToSource(source)
-            place.CreateInput("scale", names.Float2).Set(gf.Vec2f(across, up))
-            place.CreateInput("rotation", names.Float).Set(math.degrees(turn))
-            place.CreateInput("translation", names.Float2).Set(gf.Vec2f(c, f))
-            source = place.CreateOutput("result", names.Float2)
-        texture.CreateInput("st", names.Float2).ConnectToSource(source)
-        for entry, channel in entries.items():
-            self._connect(entry, texture, channel, "Float3" if channel == "rgb" else "Float")
+            placing = {"in": source, "scale": (across, up), "translation": (c, f)}
+            inputs = {key: ("Float2", value) for key, value in placing.items()}
+            inputs["rotation"] = "Float", math.degrees(turn)
+            source = self._shader(f"{name}_place", "UsdTransform2d", inputs).CreateOutput("result", names.Float2)
+        texture = self._shader(
+            name,
+            "UsdUVTexture",
+            {
+                "file": ("Asset", f"./{self._files[kind].name}"),
+                "sourceColorSpace": ("Token", space),
+                "scale": ("Float4", scale),
+                "bias": ("Float4", bias),
+                "wrapS": ("Token", picture.use.wrap[0]),
+                "wrapT": ("Token", picture.use.wrap[1]),
+                "st": ("Float2", source),
+            },
+        )
+        return lambda channel: texture.CreateOutput(channel, names.Float3 if channel == "rgb" else names.Float)
 
 
 def _write_light(pxr: Any, stage: Any, where: str, light: Light, shot: Shot) -> None:
