@@ -6,7 +6,6 @@ primaries), or environments. Other files in it are not changed. A frame gets its
 
 from __future__ import annotations
 
-import contextlib
 import fractions
 import os
 import pathlib
@@ -28,7 +27,7 @@ from warp_ar.output.places import earlier_frames
 from warp_ar.output.sink import Sink, ThreadedSink, check_image, make_folder
 from warp_ar.output.video_sink import VIDEO_SUFFIXES, VideoSink
 from warp_ar.signals import REC_709
-from warp_ar.signature import encode_png, is_signed
+from warp_ar.signature import encode_png
 
 FOLDER_CODINGS: Final = {"8bit": "numbered frames", "16bit": "numbered frames of 16 bits", "exr": "numbered OpenEXRs"}
 """Codings of a folder's pictures, with their descriptions."""
@@ -114,33 +113,20 @@ class FolderSink(ThreadedSink):
 class EnvironmentSink(FolderSink):
     """A folder of ``NNNN.exr``, numbered from 0, each as `write_environment` writes it.
 
-    The first map also removes this program's files in the subfolders ``ball_1``, ``ball_2``, ...: light of an earlier
-    run at mirror balls that the scene may no longer have.
+    The first map also removes the maps in the subfolders ``ball_1``, ``ball_2``, ...: light of an earlier run at mirror
+    balls that the scene may no longer have.
     """
 
     _suffix = ".exr"
 
     def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False) -> None:
         super().__init__(path, overwrite=overwrite)
-        stale: list[pathlib.Path] = []
-        for folder in self._path.glob("ball_[1-9]*"):
+        for folder in self._path.glob("ball_*"):
             if folder.name.removeprefix("ball_").isdecimal() and folder.is_dir():
-                stale += [one for one in earlier_frames(folder, self._suffix, overwrite=True) if is_signed(one)]
-        if stale:
-            self._earlier += stale
-            say = f"{self.replaced}; " if self.replaced else ""
-            self.replaced = f"{say}{self._path}/ball_*: {len(stale)} environments of an earlier run are removed"
+                self._find_earlier(folder, self._suffix, overwrite=overwrite)
 
     def _check(self, image: Any) -> None:
         check_environment(image)
-
-    def write(self, image: npt.NDArray[Any]) -> None:
-        """Write the next map; the first one removes an earlier run's maps, and folders that become empty."""
-        emptied = {path.parent for path in self._earlier} - {self._path}
-        super().write(image)
-        for folder in emptied:
-            with contextlib.suppress(OSError):  # it contains other files, so the folder stays
-                folder.rmdir()
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         write_environment(self._path / f"{index:04d}.exr", image, overwrite=True)
