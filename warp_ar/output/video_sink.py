@@ -11,7 +11,6 @@ import fractions
 import math
 import os
 import pathlib
-from collections.abc import Mapping
 from typing import Any
 
 import av
@@ -163,17 +162,24 @@ class VideoSink(ThreadedSink):
         options = {**fragments, "flush_packets": "1"}
         self._container = av.open(self._file, "w", format=_FORMATS[self._path.suffix.lower()], options=options)
         self._container.metadata["comment"] = PROGRAM
-        self._stream = add_stream(self._container, self._rate, width, height, self._encoding, {"g": str(group)})
-        if movie and self._encoding.encoder in ("libx265", "hevc_nvenc", "hevc_videotoolbox"):
+        encoding, options = self._encoding, {"g": str(group), **self._encoding.options}
+        self._stream = self._container.add_stream(encoding.encoder, rate=self._rate, options=options)
+        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, encoding.pixel_format
+        context = self._stream.codec_context
+        context.color_range = ColorRange.MPEG
+        context.colorspace, context.color_primaries, context.color_trc = _TAGS[encoding.coding]
+        if movie and encoding.encoder in ("libx265", "hevc_nvenc", "hevc_videotoolbox"):
             tag_for_players(self._stream)
-        self._stream.time_base = self._stream.codec_context.time_base = self._tick
+        self._stream.time_base = context.time_base = self._tick
         self._container.start_encoding()
-        self._converter = rgb_to_yuv(width, height, self._tick, self._encoding.coding, self._encoding.pixel_format)
+        self._converter = rgb_to_yuv(width, height, self._tick, encoding.coding, encoding.pixel_format)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         if self._broken:
             return  # FFmpeg may crash if writing continues after a failure.
-        image = of_even_size(image)
+        height, width = image.shape[:2]
+        if height % 2 or width % 2:
+            image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         try:
             if self._container is None:
                 self._start(image.shape[1], image.shape[0])
@@ -219,43 +225,12 @@ def _count_frames(path: pathlib.Path) -> int:
         return 0
 
 
-def add_stream(
-    container: Any, rate: fractions.Fraction, width: int, height: int, encoding: Encoding, options: Mapping[str, str]
-) -> Any:
-    """Add a video stream to a new container, with its colour space in the metadata.
-
-    Args:
-        container: Output container of PyAV.
-        rate: Frames per second.
-        width: Width in pixels, even.
-        height: Height in pixels, even.
-        encoding: Encoder, coding and options.
-        options: Default options of the encoder, which ``encoding`` overrides.
-    """
-    stream = container.add_stream(encoding.encoder, rate=rate, options={**options, **encoding.options})
-    stream.width, stream.height, stream.pix_fmt = width, height, encoding.pixel_format
-    context = stream.codec_context
-    context.color_range = ColorRange.MPEG
-    context.colorspace, context.color_primaries, context.color_trc = _TAGS[encoding.coding]
-    return stream
-
-
 def tag_for_players(stream: Any) -> None:
     """Set the tag of H.265 in MP4 and MOV that Apple's players expect."""
     stream.codec_context.codec_tag = "hvc1"
 
 
-def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return a picture padded to even size by repeating its last row or column, for chroma subsampling."""
-    height, width = image.shape[:2]
-    if height % 2 or width % 2:
-        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    return image
-
-
-def rgb_to_yuv(
-    width: int, height: int, time_base: fractions.Fraction, coding: str = "8bit", pixel_format: str = "yuv420p"
-) -> Any:
+def rgb_to_yuv(width: int, height: int, time_base: fractions.Fraction, coding: str, pixel_format: str) -> Any:
     """Return the filter from rgb24, or from 16-bit Y'CbCr without subsampling, to an encoder's input format.
 
     8-bit RGB becomes BT.709 with limited range; pictures with more bits are Y'CbCr already. Chroma is sited at the left
