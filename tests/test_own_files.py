@@ -15,10 +15,10 @@ from warp_ar import calibrate
 from warp_ar.calibration.camera_calibration import CameraReport, write_camera
 from warp_ar.calibration.response import write_response
 from warp_ar.command_line import Terminated
-from warp_ar.errors import SinkError, UsageError
+from warp_ar.errors import SinkError
 from warp_ar.files import create_new, name_aside, write_whole
 from warp_ar.output.environment_file import write_environment
-from warp_ar.output.places import OwnFiles
+from warp_ar.output.places import claim_places
 from warp_ar.output.sinks import open_sink
 from warp_ar.output.video_sink import VideoSink, WholeFragments
 from warp_ar.scene import Camera
@@ -26,37 +26,31 @@ from warp_ar.signature import COMMENT, PROGRAM, is_signed, sign_png
 from warp_ar.tracking.card_layout import CARD_MARKER
 
 
+def claimed(folder: pathlib.Path, *, overwrite: bool = False) -> None:
+    claim_places({}, {name: folder / name for name in ("a.md", "b.md")}, overwrite=overwrite)
+
+
 def test_all_names_are_looked_at_before_the_folder_is_made(tmp_path: pathlib.Path, capsys) -> None:
     folder = tmp_path / "deep" / "out"
-    files = OwnFiles(folder, ["a.md", "b.md"], overwrite=False)
-    assert files.write("a.md", f"{COMMENT}\nä\n").read_text(encoding="utf-8") == f"{COMMENT}\nä\n"
-    with pytest.raises(ValueError, match=r"c\.md is not among"):
-        files.write("c.md", "")
+    claimed(folder)
+    (folder / "a.md").write_text(f"{COMMENT}\n")
     assert capsys.readouterr().err == ""
-    OwnFiles(folder, ["a.md", "b.md"], overwrite=False)
+    claimed(folder)
     assert "a.md is replaced: this program wrote it before" in capsys.readouterr().err
     (folder / "b.md").write_text("mine")
     with pytest.raises(SinkError, match=r"b\.md is there, and this program did not write it"):
-        OwnFiles(folder, ["a.md", "b.md"], overwrite=False)
-    OwnFiles(folder, ["a.md", "b.md"], overwrite=True).write("b.md", b"yours")
-    assert (folder / "b.md").read_bytes() == b"yours"
-    assert sorted(path.name for path in folder.iterdir()) == ["a.md", "b.md"]
-
-
-def test_what_is_read_is_not_written(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "lines").write_text("{}")
-    (tmp_path / "a.md").hardlink_to(tmp_path / "lines")
-    with pytest.raises(UsageError, match="is the same as --extra"):
-        OwnFiles(tmp_path, ["a.md"], overwrite=True, reads={"--extra": [tmp_path / "lines"]})
+        claimed(folder)
+    claimed(folder, overwrite=True)
+    assert (folder / "b.md").read_text() == "mine"
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: pathlib.Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(SinkError, match="file"):
-        OwnFiles(tmp_path / "file" / "out", ["a.md"], overwrite=False)
+        claimed(tmp_path / "file" / "out")
     (tmp_path / "a.md").mkdir()
     with pytest.raises(SinkError, match="is a folder"):
-        OwnFiles(tmp_path, ["a.md"], overwrite=True)
+        claimed(tmp_path, overwrite=True)
 
 
 # --- Files set aside: random names, created new, no link followed ----------------------------------------------------

@@ -305,9 +305,7 @@ def write_whole(
         raise
 
 
-def store(
-    path: pathlib.Path, write: bytes | Callable[[pathlib.Path], object], *, suffix: str = "", label: str | None = None
-) -> None:
+def store(path: pathlib.Path, write: bytes | Callable[[pathlib.Path], object], *, suffix: str = "") -> None:
     """Write a file with `write_whole`; name the file in the error.
 
     Raises:
@@ -316,7 +314,7 @@ def store(
     try:
         write_whole(path, write, suffix=suffix)
     except (OSError, RuntimeError) as error:  # RuntimeError: raised by OpenEXR
-        raise SinkError(f"{label or path} cannot be written: {reason(error)}") from error
+        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 
 
 def name_aside(path: pathlib.Path, suffix: str = "") -> pathlib.Path:

@@ -27,7 +27,8 @@ from warp_ar.accuracy.report import MIN_COLUMNS, print_table
 from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
 from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
-from warp_ar.output.places import OwnFiles
+from warp_ar.files import store
+from warp_ar.output.places import claim_places
 from warp_ar.signature import COMMENT, software_exif
 
 try:
@@ -81,17 +82,17 @@ def encode_webp(picture: npt.NDArray[Any]) -> bytes:
     return data.getvalue()
 
 
-def write_figure(figure: PaperFigure, out: OwnFiles, folder: str) -> str:
-    """Write a figure's picture and plots; return its section of the Markdown page, which links into ``folder``."""
+def write_figure(figure: PaperFigure, out: Path) -> str:
+    """Write a figure's picture and plots; return its section of the Markdown page, which links into the folder."""
     name = f"figure{figure.number}"
-    out.write(f"{name}.webp", encode_webp(figure.picture))
-    parts = [f"## Figure {figure.number}: {figure.title}", figure.text, f"![{figure.title}]({folder}/{name}.webp)"]
+    store(out / f"{name}.webp", encode_webp(figure.picture))
+    parts = [f"## Figure {figure.number}: {figure.title}", figure.text, f"![{figure.title}]({out.name}/{name}.webp)"]
     below = "; below each its FLIP to the truth" if "truth" in figure.labels and figure.number not in (5, 6) else ""
     parts += [f"From left to right: {', '.join(figure.labels)}{below}.", as_markdown(figure.head, figure.rows)]
     for index, plot in enumerate(figure.plots):
         file = f"{name}{'ab'[index] if len(figure.plots) > 1 else ''}.svg"
-        out.write(file, f"{COMMENT}\n{plot}")
-        parts.append(f"![{figure.head[-1]}]({folder}/{file})")
+        store(out / file, f"{COMMENT}\n{plot}".encode())
+        parts.append(f"![{figure.head[-1]}]({out.name}/{file})")
     return "\n\n".join(parts)
 
 
@@ -123,7 +124,9 @@ def make_all(options: argparse.Namespace) -> int:
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
     made = [f"figure{name}{ending}" for name in names if name != READINGS for ending in ENDINGS]
-    out = None if options.out is None else OwnFiles(options.out, [*made, PAGE], overwrite=options.overwrite)
+    out: Path | None = options.out
+    if out is not None:
+        claim_places({}, {f"--out, {name}": out / name for name in (*made, PAGE)}, overwrite=options.overwrite)
     sections = []
     for name in track(names, "figures", console=console):
         if name == READINGS:
@@ -135,10 +138,10 @@ def make_all(options: argparse.Namespace) -> int:
         figure = FIGURES[int(name)](context)
         print_table(console, f"Figure {name}: {figure.title}", figure.head, figure.rows)
         if out is not None:
-            sections.append(write_figure(figure, out, options.out.name))
+            sections.append(write_figure(figure, out))
     if out is not None:
-        out.write(PAGE, "\n\n".join([COMMENT, *sections]) + "\n")
-        console.print(f"written to {options.out}", highlight=False)
+        store(out / PAGE, ("\n\n".join([COMMENT, *sections]) + "\n").encode())
+        console.print(f"written to {out}", highlight=False)
     return EXIT_DONE
 
 

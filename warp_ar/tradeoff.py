@@ -29,7 +29,8 @@ from warp_ar.accuracy.report import MIN_COLUMNS, make_cost_table, make_preset_li
 from warp_ar.command_line import EXIT_DONE, Parser, count, run_command
 from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
-from warp_ar.output.places import OwnFiles
+from warp_ar.files import store
+from warp_ar.output.places import claim_places
 from warp_ar.stages.quality import PRESETS
 
 DEFAULT_FRAMES = 999
@@ -151,7 +152,9 @@ def tradeoff(options: argparse.Namespace) -> int:
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
     names = ("tradeoff.jsonl", *(("presets.json",) if options.presets else ("cost_table.json", "tradeoff.html")))
-    out = None if options.out is None else OwnFiles(options.out, names, overwrite=options.overwrite)
+    out: Path | None = options.out
+    if out is not None:
+        claim_places({}, {f"--out, {name}": out / name for name in names}, overwrite=options.overwrite)
     asked = asked_cases(options, console)
     if options.frames < SETTLED:
         console.print(
@@ -177,14 +180,14 @@ def tradeoff(options: argparse.Namespace) -> int:
     if out is None:
         return EXIT_DONE
     lines = (json.dumps(record) for report in reports for record in records(report, str(device)))
-    out.write("tradeoff.jsonl", "\n".join(lines) + "\n")
+    store(out / "tradeoff.jsonl", ("\n".join(lines) + "\n").encode())
     if options.presets:
-        out.write("presets.json", json.dumps(make_preset_list(reports, str(device)), indent=1) + "\n")
+        store(out / "presets.json", (json.dumps(make_preset_list(reports, str(device)), indent=1) + "\n").encode())
     else:
-        out.write("cost_table.json", json.dumps(table, indent=1) + "\n")
+        store(out / "cost_table.json", (json.dumps(table, indent=1) + "\n").encode())
         made = table["made"] | {"clock": "processor time" if options.processor_time else "time"}
-        out.write("tradeoff.html", tradeoff_page.render(reports, made))
-    console.print(f"written to {options.out}", highlight=False)
+        store(out / "tradeoff.html", tradeoff_page.render(reports, made).encode())
+    console.print(f"written to {out}", highlight=False)
     return EXIT_DONE
 
 

@@ -10,13 +10,13 @@ import argparse
 import contextlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import filelock
 
 from warp_ar.errors import SinkError, UsageError, reason, say
-from warp_ar.files import is_same_file, kind_of, store
+from warp_ar.files import is_same_file, kind_of
 from warp_ar.output.sink import make_folder
 from warp_ar.scene import Scene
 from warp_ar.scene.scene_files import files_of
@@ -114,8 +114,8 @@ def claim_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]
     for words in [check_replaceable(path, overwrite=overwrite) for path in writes.values()]:
         if words:
             say(words)
-    for path in writes.values():
-        make_folder(path.parent)
+    for folder in dict.fromkeys(path.parent for path in writes.values()):
+        make_folder(folder)
 
 
 def reads_of(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:
@@ -148,54 +148,3 @@ def folder_to_oneself(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             os.unlink(lock.lock_file)
         lock.release()
-
-
-class OwnFiles:
-    """Folder with the files that a command may write in it."""
-
-    def __init__(
-        self,
-        folder: Path,
-        names: Iterable[str],
-        *,
-        overwrite: bool,
-        role: str = "--out",
-        reads: Mapping[str, Sequence[Path]] | None = None,
-    ) -> None:
-        """Check the outputs before anything is computed, and report on stderr which files will be replaced.
-
-        Args:
-            folder: The folder; it is made if missing.
-            names: Names of all files that may be written.
-            overwrite: True to replace files that this program did not write.
-            role: Name of the folder in messages.
-            reads: Files that the command reads, by option ("--extra").
-
-        Raises:
-            SinkError: A file may not be replaced, or the folder cannot be made.
-            UsageError: An output file is also an input.
-        """
-        self._folder, self._names, self._role = folder, tuple(names), role
-        replaced = []
-        for name in self._names:
-            check_places(reads or {}, {role: folder / name})
-            replaced.append(check_replaceable(folder / name, overwrite=overwrite))
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise SinkError(f"{role} {folder} cannot be made: {reason(error)}") from error
-        for words in filter(None, replaced):
-            say(words)
-
-    def write(self, name: str, data: str | bytes) -> Path:
-        """Write a file, text as UTF-8, and return its path.
-
-        Raises:
-            SinkError: The file cannot be written; a former file is kept.
-            ValueError: The name is not among ``names``.
-        """
-        if name not in self._names:
-            raise ValueError(f"{name} is not among the files that were looked at: {', '.join(self._names)}")
-        path = self._folder / name
-        store(path, data.encode() if isinstance(data, str) else data, label=f"{self._role} {path}")
-        return path
