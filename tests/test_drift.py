@@ -5,11 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-import warp as wp
 
 from tests.simulated_camera import decode_srgb
 from warp_ar import Pipeline
-from warp_ar.kernels.environment.accumulate import scale_radiance
 from warp_ar.scene import Pose, Scene, loads_scene
 from warp_ar.sources.deep_frame import DeepFrame
 from warp_ar.tracking.drift import CONTRASTS, ExposureDrift
@@ -138,13 +136,6 @@ def test_a_tone_curve_is_told_by_a_drift_where_ink_is_grey():
     assert bent.contrast >= 0.5
     assert bent.gain == pytest.approx([gains[-1]] * 3, rel=0.1)
     assert follow([encode(picture * gain) for gain in gains]).contrast == 0.0
-
-
-def test_remembered_light_is_scaled(device):
-    with wp.ScopedDevice(device):
-        light = wp.array(np.arange(24, dtype=np.float32).reshape(2, 4, 3), dtype=wp.vec3)
-        scale_radiance(light, (2.0, 1.0, 0.5))
-        assert np.array_equal(light.numpy(), np.arange(24).reshape(2, 4, 3) * np.array([2.0, 1.0, 0.5]))
 
 
 def test_virtual_lights_keep_their_value_while_the_exposure_moves():

@@ -62,13 +62,6 @@ def test_every_sample_lies_in_the_texel_that_it_shows(device, size):
     assert len(np.unique(texel)) > min(height * width, 1024) // 3
 
 
-def test_sets_are_stratified():
-    points = [(reference.radical_inverse(i), reference.sobol_second(i)) for i in range(1024)]
-    for start in range(0, 1024, 64):
-        cells = {(int(u * 8), int(v * 8)) for u, v in points[start : start + 64]}
-        assert len(cells) == 64
-
-
 def test_sobol_matches_its_twin(device):
     out = wp.zeros(1024, wp.float32)
     wp.launch(_sobol_kernel, dim=1024, outputs=[out])
@@ -88,22 +81,6 @@ def test_texels_list_the_map(device):
     np.testing.assert_allclose(directions.numpy().reshape(8, 16, 3), wi, atol=1e-6)
     np.testing.assert_allclose(flux.numpy().reshape(8, 16, 3), solid_angle[..., None] * environment, rtol=1e-5)
     np.testing.assert_allclose(samples.numpy()["measure"].sum(), 4 * np.pi, rtol=SUM_ERROR)
-
-
-def test_lamps_give_their_samples_a_place(device):
-    at = np.array([0.3, -0.1, 0.2])
-    direction = (at - ORIGIN) / np.linalg.norm(at - ORIGIN)
-    environment = sky(0.5, (64, 128))
-    wi = reference.texel_directions(64, 128)[0]
-    environment[wi @ direction > np.cos(0.1)] = 40.0
-    environment[wi[..., 2] > np.cos(0.1)] = 40.0
-    _, _, samples = list_texels(environment)
-    environment_samples.place_emitters(lamp_at(at, None), ONE_BALL, samples)
-    found = samples.numpy()
-    near = found["distance"] < 1e29
-    np.testing.assert_array_equal(near, (wi @ direction > np.cos(0.1)).ravel())
-    np.testing.assert_allclose(found["distance"][near], np.linalg.norm(at - ORIGIN), rtol=1e-5)
-    assert np.isfinite(found["distance"]).all()
 
 
 def test_lamps_are_placed_from_where_the_ball_mirrors_them(device):

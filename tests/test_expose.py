@@ -169,12 +169,6 @@ def test_declipped_pixels_show_their_estimate(device, scale):
     check_error("expose", run(frame, scale, "declipped"), exact)
 
 
-def test_pixel_with_a_hue_is_not_lifted(device):
-    """Orange that clips in red alone fades with its surroundings, however large it is."""
-    frame = np.full((64, 64, 3), (255, 230, 120), np.uint8)
-    np.testing.assert_array_equal(run(frame, 0.5), run(frame, 0.5, "plain"))
-
-
 @pytest.mark.parametrize(("other", "factor"), [(255, 1.0), (191, 0.806), (128, 0.615)])
 def test_the_papers_factor_by_hand(device, other, factor):
     """Stripes of white and of another code, far wider than the box: a is their mean, factor = s + (1 - s) (2 a - 1).

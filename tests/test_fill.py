@@ -13,8 +13,6 @@ from warp_ar.kernels.environment.fill_frame import FRAME_TRUST, OWN_SHADOW, fill
 from warp_ar.scene import loads_scene
 from warp_ar.scene.ray_scene import HostScene
 
-# Float32 sums and exponentials, a few roundings each.
-ROUNDING = 2e-6
 SIZES = [(32, 64), (64, 128), (7, 14), (5, 9), (1, 2), (1, 7), (3, 1), (1, 1), (16, 33), (2, 4)]
 
 
@@ -80,29 +78,6 @@ def test_a_hole_in_a_ramp_is_bridged_without_shift(device, height, width):
         weight = latlong.solid_angles(height, width)[inside][:, None]
         # On average it leans nowhere: half a texel of the coarsest level that fits the hole would be 0.2.
         assert np.abs((across * weight).sum(0) / weight.sum()).max() < 0.05, name
-
-
-def test_rotating_the_environment_rotates_the_fill(device):
-    """The seam is nowhere special: turned by a multiple of the coarsest texels used, the result turns along to the
-    bit."""
-    rng = np.random.default_rng(7)
-    radiance, confidence = rng.uniform(0, 1, (16, 32, 3)), (rng.random((16, 32)) > 0.7) * 1.0
-    turned = filled(np.roll(radiance, 16, 1), np.roll(confidence, 16, 1))
-    np.testing.assert_allclose(turned, np.roll(filled(radiance, confidence), 16, 1), atol=ROUNDING)
-
-
-def test_low_confidence_blends_smoothly(device):
-    """From 0 to 0.5 a texel moves from its neighbours' value to its own without a jump."""
-    values = []
-    for c in np.linspace(0, 0.6, 25):
-        radiance, confidence = np.full((16, 32, 3), 0.2), np.ones((16, 32))
-        radiance[8, 16], confidence[8, 16] = 1.0, c
-        values.append(filled(radiance, confidence)[8, 16, 0])
-    steps = np.diff(values)
-    assert values[0] == pytest.approx(0.2, abs=1e-6)
-    assert values[-1] == pytest.approx(1.0, abs=1e-6)
-    assert (steps >= -1e-6).all()
-    assert steps.max() < 0.1
 
 
 # --- What the camera sees beyond and beside the ball goes into the map where the ball does not tell -------------------

@@ -32,12 +32,6 @@ def solid_angle_kernel(area_out: wp.array2d[wp.float32]):
 
 
 @wp.kernel(enable_backward=False)
-def wrap_kernel(height: wp.int32, width: wp.int32, texel: wp.array[wp.vec2i], texel_out: wp.array[wp.vec2i]):
-    i = wp.tid()
-    texel_out[i] = latlong.wrap_texel(texel[i][0], texel[i][1], height, width)
-
-
-@wp.kernel(enable_backward=False)
 def sample_kernel(radiance: wp.array2d[wp.vec3], direction: wp.array[wp.vec3], value_out: wp.array[wp.vec3]):
     i = wp.tid()
     value_out[i] = latlong.sample_latlong(radiance, direction[i])
@@ -104,12 +98,6 @@ def test_solid_angles(device, height, width):
     assert area.numpy().astype(np.float64).sum() == pytest.approx(4 * np.pi, rel=1e-6)
 
 
-def test_wrapping(device):
-    texels = np.array([[0, -1], [0, 8], [-1, 0], [4, 0], [-1, 7], [2, -17], [3, 3]], np.int32)
-    expected = [[0, 7], [0, 0], [0, 4], [3, 4], [0, 3], [2, 7], [3, 3]]
-    assert run(wrap_kernel, [4, 8], texels, wp.vec2i, wp.vec2i).tolist() == expected
-
-
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_a_constant_map_samples_to_the_bit(device, height, width):
     value = np.float32([0.1, 1.7e-5, 12345.678])
@@ -132,17 +120,3 @@ def test_ramp_has_no_shift(device):
     got = sample(reference.directions(height, width), d)
     # Bilinear interpolation of a sphere errs by (pi / 128)^2 / 8 per axis.
     np.testing.assert_allclose(got, d, atol=2.5 * (np.pi / height) ** 2 / 8)
-
-
-@pytest.mark.parametrize(("height", "width"), [(8, 16), (5, 9), (6, 7)])
-def test_continuous_across_seam_and_poles(device, height, width):
-    radiance = np.random.default_rng(4).uniform(0, 1, (height, width, 3))
-    step = 1e-5
-    angle = np.random.default_rng(5).uniform(0, 2 * np.pi, 200)
-    around = np.stack([step * np.cos(angle), step * np.sin(angle), np.ones(200)], -1)
-    opposite = around * [-1, -1, 1]
-    z = np.linspace(-0.99, 0.99, 200)
-    seam = np.stack([-np.ones(200), np.full(200, step), z], -1)
-    for a, b in ((around, opposite), (around * [1, 1, -1], opposite * [1, 1, -1]), (seam, seam * [1, -1, 1])):
-        # Slopes are up to 1 per texel, and the two points at most 2 steps apart: 2e-5 * width / pi texels.
-        np.testing.assert_allclose(sample(radiance, a), sample(radiance, b), atol=4 * step * width)

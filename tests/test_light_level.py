@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import types
-
 import numpy as np
 import pytest
 import warp as wp
@@ -185,18 +183,6 @@ def test_without_surfaces_nothing_is_averaged():
     steadiness = Steadiness()
     steadiness.follow(estimate(1.0), seen(), VIEW)
     assert steadiness.follow(estimate(2.0), seen(told=False), VIEW).recovered.max() == 2.0
-
-
-def shown(exact, bound=(0, 0, 0), missing=(1.0, 1.0, 1.0), points=400):
-    """A problem in which so many points show a channel, and so many clip in it."""
-    numbers = np.arange(points)[:, None]
-    return types.SimpleNamespace(
-        exact=numbers < np.array(exact),
-        bound=numbers >= points - np.array(bound),
-        index=np.arange(points),
-        solid_angle=np.ones(1),
-        missing=np.array([missing]),
-    )
 
 
 # What clips is raised, where nothing but the map tells, by how much clips, how many channels do, and how it ends.

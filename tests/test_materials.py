@@ -14,11 +14,9 @@ from tests.twins import materials as reference
 from warp_ar.kernels.materials import (
     MIN_ALPHA,
     ggx_lobe,
-    lobe_axis,
     make_reflect_direct,
     make_surface,
     phong_lobe,
-    reflect,
 )
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit, Material, RayScene, Shape
@@ -212,37 +210,6 @@ def test_virtual_lights_from_everywhere_are_a_white_environment(device, metallic
     direct, diffuse, reflectance, _ = reflected(record, wi, [wo], device)
     total = np.sum(direct.astype(np.float64) * solid[:, None], axis=0)
     np.testing.assert_allclose(total, diffuse[0] + reflectance[0], atol=ALBEDO_TOLERANCE)
-
-
-@pytest.mark.parametrize("cos_o", [0.9, 0.25])
-@pytest.mark.parametrize("roughness", [0.5, 1.0])
-@pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_a_rough_lobe_leans_to_the_normal(device, metallic, roughness, cos_o):
-    """Its axis lies nearer to the mean direction of what is reflected than the mirror direction does."""
-    record = material(model=METALLIC_ROUGHNESS, roughness=roughness, metallic=metallic, base_color=(0.8, 0.8, 0.8))
-    wo = np.array([np.sqrt(1 - cos_o**2), 0.0, cos_o])
-    mirror = wo * [-1, -1, 1]
-    wi, solid = hemisphere(400, 128, about=mirror + np.array([1e-9, 0, 0]), width=roughness**2)
-    direct, diffuse, _, _ = reflected(record, wi, [wo], device)
-    lobe = (direct[:, 0] - diffuse[0, 0] * np.maximum(wi[:, 2], 0.0) / np.pi) * solid
-    mean = (lobe[:, None] * wi).sum(axis=0)
-    mean /= np.linalg.norm(mean)
-    out = wp.zeros(1, dtype=wp.vec3, device=device)
-    scene = RayScene()
-    scene.objects = wp.zeros(1, dtype=Shape, device=device)
-    scene.materials = wp.array(record, dtype=Material, device=device)
-    wp.launch(axis_kernel, 1, [scene, dfg_table(device), wp.vec3(*wo)], [out], device=device)
-    axis = out.numpy()[0]
-    assert np.linalg.norm(axis) == pytest.approx(1.0, abs=1e-6)
-    assert axis @ mean > mirror @ mean
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def axis_kernel(scene: RayScene, dfg: wp.array2d[wp.vec2], wo: wp.vec3, axis_out: wp.array[wp.vec3]):
-    hit = Hit()
-    hit.corner = -1
-    normal = wp.vec3(0.0, 0.0, 1.0)
-    axis_out[0] = lobe_axis(surface_at(scene, dfg, hit, wo[2], 0.0), reflect(wo, normal), normal)
 
 
 # --- Hard cases -------------------------------------------------------------------------------------------------------

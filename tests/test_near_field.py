@@ -1,5 +1,3 @@
-import warnings
-
 import numpy as np
 import pytest
 import warp as wp
@@ -185,46 +183,6 @@ def test_mirror_shows_the_picture_of_the_desk(device):
     assert POINTS[chalk][:, 0].mean() > 0
 
 
-def shown_by_a_mirror(offset):
-    """Return what a mirror ball in a black environment shows of a white desk from one place of each pixel.
-
-    NaN stands beside the ball.
-    """
-    rays = np.stack([*(RAYS + np.array(offset) / 60).transpose(2, 0, 1), np.ones((H, W))], -1) @ LOOK_DOWN.T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    to_ball = CAMERA - np.array(BALL)
-    along = rays @ to_ball
-    within = along**2 - to_ball @ to_ball + RADIUS**2
-    points = CAMERA - (along + np.sqrt(np.maximum(within, 0)))[..., None] * rays
-    normals = (points - np.array(BALL)) / RADIUS
-    mirrored = rays - 2 * (rays * normals).sum(-1, keepdims=True) * normals
-    with np.errstate(divide="ignore", invalid="ignore"):
-        desk = points + (-points[..., 2] / mirrored[..., 2])[..., None] * mirrored
-    reach = CAMERA[2] * np.array([RAYS[..., 0].max(), RAYS[..., 1].max()])
-    # From above, the ball hides no desk that it mirrors: objects are not in the picture.
-    seen = (mirrored[..., 2] < 0) & (np.abs(desk[..., :2]) < reach).all(-1)
-    return np.where(within > 0, seen, np.nan)
-
-
-PLACES = (np.arange(10) + 0.5) / 10 - 0.5
-
-
-@pytest.mark.slow
-def test_mirror_is_the_mean_over_its_pixel(device):
-    """A hundred places of each pixel, the ball's own only: near its rim neighbouring pixels have nothing in common."""
-    with np.errstate(invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        expected = np.nanmean([shown_by_a_mirror((x, y)) for x in PLACES for y in PLACES], axis=0)
-    errors = {}
-    for samples in (1, 16):
-        _, mirrored, found, _, _ = run([sphere(BALL, RADIUS)], [CHROME], samples=samples, environment_shows=0.0)
-        errors[samples] = np.abs(mirrored[..., 0] - expected)[found == 0]
-    assert len(errors[1]) > 50
-    # A place of sixteen or two on the wrong side of the desk's picture.
-    assert errors[16].max() < 0.2
-    assert errors[16].mean() < 0.25 * errors[1].mean()
-
-
 def test_levels_are_means_of_the_picture_with_what_is_virtual(device):
     """Rows and columns that are no powers of two; shadows everywhere, light within its rectangle."""
     rng = np.random.default_rng(3)
@@ -313,11 +271,3 @@ def test_averages_stop_at_creases_and_at_the_rectangle(device):
     out, _ = average(found, normals, light[..., None].repeat(3, -1), np.ones((16, 16, 4)), rect=(0, 16, 1, 16))
     np.testing.assert_allclose(out[:, 1:8], 1.0, rtol=1e-6)
     np.testing.assert_allclose(out[:, 8:], 5.0, rtol=1e-6)
-
-
-def test_few_rays_have_no_noise_where_nothing_is_near(device):
-    irradiance, _, found, hits, _ = run([sphere(BALL, RADIUS)], [CHALK], code=0, known=True, filtered=False)
-    up = hits["normal"][..., 2]
-    np.testing.assert_allclose(irradiance[(found >= 0) & (up > 0.999)], np.pi, rtol=1e-6)
-    flank = irradiance[(found >= 0) & (up < 0.4)]
-    assert 0.4 * np.pi < flank.mean() < 0.9 * np.pi

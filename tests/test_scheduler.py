@@ -127,16 +127,6 @@ def test_switching_sets_of_stages_gives_the_same_answer(monkeypatch: pytest.Monk
     scheduler.close()
 
 
-@pytest.mark.parametrize("bands", [1, 2, 3, 16])
-def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch, bands: int) -> None:
-    arrays = inputs("cpu")
-    arrays["frame"].assign(np.arange(SIZE, dtype=np.int32))
-    scheduler = Scheduler(plan_of(monkeypatch, chain("a"), ("a",)), arrays, wp.get_device("cpu"), bands=bands)
-    scheduler.run()
-    np.testing.assert_array_equal(arrays["a"].numpy(), np.arange(SIZE) + 1)
-    scheduler.close()
-
-
 def test_a_failing_band_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     class Failing(AddOne):
         name, source, target = "fails", "frame", "a"

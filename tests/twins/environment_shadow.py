@@ -3,10 +3,6 @@
 import numpy as np
 
 
-def radical_inverse(index, bits=32):
-    return sum(((index >> k) & 1) / 2.0 ** (k + 1) for k in range(bits))
-
-
 def sobol_second(index):
     """Second dimension of Sobol's sequence from its generator matrix: column k is column k - 1 xor itself shifted."""
     column, bits = 1 << 31, 0

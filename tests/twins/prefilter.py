@@ -55,34 +55,3 @@ def energy_compensation(once, f0):
     """Factor on what is reflected once: of what is left a share sqrt(once) leaves at each further scattering."""
     later = np.sqrt(once)
     return 1 + f0 * (1 / once - 1) * later / (1 - f0 * (1 - later))
-
-
-def scatterings(cos_o, roughness, count, rng, most=40):
-    """Shares of light that leave a GGX surface after 0, 1, ... scatterings between its facets: a random walk.
-
-    Heitz et al., "Multiple-Scattering Microfacet BSDFs with the Smith Model", 2016: heights are even over [-1, 1];
-    facets are drawn as they are seen, also from below (Dupuy, Benyoub, "Sampling Visible GGX Normals with Spherical
-    Caps").
-    """
-    alpha = roughness**2
-    direction = np.tile([-np.sqrt(1 - cos_o**2), 0.0, -cos_o], (count, 1))
-    height = np.full(count, 1.0)
-    left = np.zeros(most)
-    for k in range(most):
-        z = np.clip(direction[:, 2], -0.99999, 0.99999)
-        slope = alpha * np.sqrt(1 - z**2) / z
-        masking = 0.5 * (np.sign(z) * np.sqrt(1 + slope**2) - 1)
-        below, u = np.clip(0.5 * (height + 1), 1e-12, 1), rng.random(len(z))
-        with np.errstate(over="ignore", divide="ignore"):
-            leaves = (z > 0) & (u > 1 - below**masking)
-            met = 2 * below / (1 - u) ** (1 / masking) - 1
-        left[k] = leaves.sum() / count
-        direction, height = direction[~leaves], met[~leaves]
-        seen = -direction * [alpha, alpha, 1.0]
-        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-        turn, rise = 2 * np.pi * rng.random(len(seen)), (1 - rng.random(len(seen))) * (1 + seen[:, 2]) - seen[:, 2]
-        flat = np.sqrt(np.clip(1 - rise**2, 0, 1))
-        facet = (np.stack([flat * np.cos(turn), flat * np.sin(turn), rise], -1) + seen) * [alpha, alpha, 1.0]
-        facet /= np.maximum(np.linalg.norm(facet, axis=1, keepdims=True), 1e-12)
-        direction = direction - 2 * np.sum(direction * facet, axis=1, keepdims=True) * facet
-    return left

@@ -4,24 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-MASK = 0xFFFFFFFF
-
-
-def pcg3d_hash(x, y, z):
-    x, y, z = ((v * 1664525 + 1013904223) & MASK for v in (x, y, z))
-    x = (x + y * z) & MASK
-    y = (y + z * x) & MASK
-    z = (z + x * y) & MASK
-    x, y, z = x ^ (x >> 16), y ^ (y >> 16), z ^ (z >> 16)
-    x = (x + y * z) & MASK
-    y = (y + z * x) & MASK
-    z = (z + x * y) & MASK
-    return x, y, z
-
-
-def radical_inverse(index):
-    return int(f"{index:032b}"[::-1], 2) / 2.0**32
-
 
 def ggx_distribution(cos_theta, alpha):
     """[Walter07] eq. 33 as printed."""
