@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
 from tests.recover_rig import solve_here
@@ -86,14 +84,6 @@ def pictures() -> tuple[np.ndarray, ...]:
 
 
 Frame = tuple[str, bool, str, int, float]
-FRAMES = st.tuples(
-    st.sampled_from(list(POSES)),
-    st.booleans(),
-    st.sampled_from(("on", "off", "one", "aside")),
-    st.integers(0, 3),
-    st.sampled_from((1 / 30, 0.15, 0.5)),
-)
-"""Pose, whether objects can be seen, lights, picture, seconds since the frame before."""
 
 
 def run(
@@ -127,19 +117,6 @@ def assert_equal(path: Sequence[Frame], device: str, preset: str, **more: Any) -
         differing = int((one.image != other.image).any(-1).sum())
         assert differing == 0, f"frame {index} of {path}: {differing} pixels differ"
     return culled
-
-
-@pytest.mark.parametrize("preset", QUALITIES)
-@settings(
-    max_examples=3,
-    deadline=None,
-    derandomize=True,
-    # The fixture is the device's name, the same for every path.
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-)
-@given(path=st.lists(FRAMES, min_size=3, max_size=7))
-def test_pictures_are_those_of_a_pipeline_that_leaves_nothing_out(path: list[Frame], device: str, preset: str) -> None:
-    assert_equal(path, device, preset)
 
 
 SHORT = 1 / 30

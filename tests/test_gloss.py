@@ -59,8 +59,8 @@ FLOAT_ERROR = 1e-5
 RAYS_ERROR = 0.04
 # Radiance of a highlight that is looked for, and as much again.
 LEAST_HIGHLIGHT = 4e-4
-# Masking and Fresnel at the middle of a sphere; aslant, an ellipse of half vectors that is taken as a circle.
-SPHERE_ERROR = {"from above": 0.02, "aslant": 0.2}
+# Masking and Fresnel at the middle of a sphere.
+SPHERE_ERROR = 0.02
 
 
 def directions(pose=POSE, rays=RAYS):
@@ -179,19 +179,11 @@ def test_a_lamp_has_a_highlight(device):
     assert shaded[peak, 0] < 0.5 * expected[peak, 0]
 
 
-@pytest.mark.parametrize(
-    ("roughness", "radius", "seen"),
-    [
-        (0.4, 0.005, "from above"),
-        (0.2, 0.06, "aslant"),
-    ],
-)
-def test_a_sphere_has_a_wider_highlight(device, roughness, radius, seen):
+def test_a_sphere_has_a_wider_highlight(device):
     """That of all its directions, summed up; a point's would be up to five times as bright."""
-    above = seen == "from above"
-    eye = np.array([0.0, -0.03, 0.4]) if above else EYE
-    pose = look_at(eye, np.array([0.0, 0.05, 0.0])) if above else POSE
-    lamp = {**LAMP, "radius": radius, "position": (0.02, 0.1, 0.35) if above else LAMP["position"]}
+    roughness, radius, eye = 0.4, 0.005, np.array([0.0, -0.03, 0.4])
+    pose = look_at(eye, np.array([0.0, 0.05, 0.0]))
+    lamp = {**LAMP, "radius": radius, "position": (0.02, 0.1, 0.35)}
     got = run((roughness, F0), lights=[lamp], objects=(), pose=pose)
     point = run((roughness, F0), lights=[{**lamp, "radius": 0.0}], objects=(), pose=pose)
     pixels = np.argwhere(np.maximum(got, point).max(-1) > LEAST_HIGHLIGHT)
@@ -205,14 +197,14 @@ def test_a_sphere_has_a_wider_highlight(device, roughness, radius, seen):
         return np.abs(change[tuple(pixels.T)] - expected).sum() / expected.sum()
 
     assert len(pixels) > 30
-    assert error(got) < SPHERE_ERROR[seen]
+    assert error(got) < SPHERE_ERROR
     assert error(got) < 0.6 * error(point)
 
 
 # --- hard cases
 
 
-@pytest.mark.parametrize("height", [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("height", [1e-4, 1e-2])
 @pytest.mark.parametrize("roughness", [0.0, 1e-3, 0.1, 1.0])
 def test_grazing_view(device, height, roughness):
     """Fresnel goes to 1, masking to 0: finite, and no more than the surroundings differ by."""

@@ -16,9 +16,7 @@ from warp_ar.kernels.environment.lobes import (
     lobe_offset,
     lobe_size,
     lobe_texels,
-    sample_levels,
 )
-from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.kernels.split_sum import energy_compensation, integrate_dfg, sample_dfg
 from warp_ar.scene import loads_scene
 from warp_ar.stages.base import Arrays
@@ -49,15 +47,6 @@ def scene(*materials):
             f'[[object]]\nshape = "sphere"\nradius = 0.05\n[object.material]\n{MATERIALS[m]}\n' for m in materials
         )
     )
-
-
-@wp.kernel(enable_backward=False)
-def sample_kernel(
-    levels: wp.array[wp.vec3], level: wp.float32, height: wp.int32, at: wp.array[wp.vec2], out: wp.array[wp.vec3]
-):
-    i = wp.tid()
-    d = direction_from_latlong(at[i][0], at[i][1], height, 2 * height)
-    out[i] = sample_levels(levels, d * 3.0, level, height)
 
 
 @wp.kernel(enable_backward=False)
@@ -100,14 +89,6 @@ def unpack(levels, height):
         size, start = lobe_size(height, level), lobe_offset(height, level)
         result.append(texels[start : start + size[0] * size[1]].reshape(*size, 3))
     return result
-
-
-def sample(levels, height, at, level):
-    out = wp.zeros(len(at), dtype=wp.vec3)
-    wp.launch(
-        sample_kernel, len(at), [levels, level, height, wp.array(np.asarray(at, np.float32), dtype=wp.vec2)], [out]
-    )
-    return out.numpy()
 
 
 # --- Where levels lie -------------------------------------------------------------------------------------------------
@@ -181,19 +162,6 @@ def test_the_reference_is_the_twin_s(device, lobe, height):
         check_error("prefilter", level.reshape(-1, 3), twin)
 
 
-@pytest.mark.parametrize(("roughness", "bound"), [(0.5, 0.005), (0.7, 0.01), (1.0, 0.04)])
-def test_compensation_is_what_a_random_walk_between_facets_finds(device, roughness, bound):
-    """Light that scatters often, of every F0: seen from ahead, where most of it is lost, to grazing."""
-    rng, f0 = np.random.default_rng(7), np.array([0.3, 0.6, 0.95])
-    for cos_o in (0.2, 0.5, 0.9):
-        shares = reference.scatterings(cos_o, roughness, 60_000, rng)
-        assert shares[0] == 0.0
-        assert shares.sum() == pytest.approx(1.0, abs=1e-3)
-        walked = (shares[:, None] * f0 ** np.arange(len(shares))[:, None]).sum(axis=0)
-        found = f0 * shares[1] * reference.energy_compensation(shares[1], f0)
-        np.testing.assert_allclose(found, walked, rtol=bound)
-
-
 def test_compensation_matches_the_twin(device):
     at = wp.array(np.random.default_rng(2).random((500, 2)).astype(np.float32), dtype=wp.vec2)
     table = wp.zeros((32, 32), dtype=wp.vec2)
@@ -206,21 +174,6 @@ def test_compensation_matches_the_twin(device):
 
 
 # --- Energy, seam, poles, hard cases ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_seam_and_poles_are_continuous(device, method):
-    height = 16
-    levels = run(np.random.default_rng(5).random((height, 2 * height, 3)), method)
-    step = 1e-3
-    for level in (0.0, 0.4, 1.0, 1.7, 3.0):
-        beside = [[r, c] for r in (0.3, 4.2, 8.0, 15.9) for c in (step, 2 * height - step)]
-        values = sample(levels, height, beside, level).reshape(-1, 2, 3)
-        np.testing.assert_allclose(values[:, 0], values[:, 1], atol=5 * step)
-        across = [[step, c + half] for c in (1.0, 7.3, 15.5) for half in (0, height)]
-        values = sample(levels, height, across, level).reshape(-1, 2, 3)
-        np.testing.assert_allclose(values[:, 0], values[:, 1], atol=5 * step)
-    assert np.isfinite(sample(levels, height, [[0, 0], [height, 0], [height, 2 * height]], 99.0)).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -252,23 +205,3 @@ def test_the_split_sum_is_the_quadrature_s(device):
 
 
 # --- Wiring -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("lobe", LOBES)
-def test_the_reference_agrees_with_monte_carlo(device, lobe):
-    height, count = 32, 200_000
-    radiance = np.random.default_rng(3).random((height, 2 * height, 3)) ** 4
-    level = lobe_count(height) - 2  # alpha 1/2
-    alpha = lobe_alpha(height, level)
-    ours = unpack(run(radiance, "brute_force", lobe), height)[level]
-    rng = np.random.default_rng(4)
-    samples = rng.standard_normal((count, 3))
-    samples /= np.linalg.norm(samples, axis=1, keepdims=True)
-    row, column = latlong.coordinates(samples, height, 2 * height)
-    seen = radiance[np.minimum(row.astype(int), height - 1), column.astype(int) % (2 * height)]
-    directions = latlong.directions(*ours.shape[:2])
-    for at in ((0, 0), (3, 7), (ours.shape[0] - 1, 5)):
-        weight = reference.lobe(samples @ directions[at], alpha, lobe)[:, None]
-        estimate = (weight * seen).sum(0) / weight.sum()
-        error = np.sqrt((weight**2 * (seen - estimate) ** 2).sum(0)) / weight.sum()
-        assert (np.abs(estimate - ours[at]) < 5 * error + 1e-3).all()

@@ -49,10 +49,6 @@ def test_between_two_balls_weights_are_linear_and_beside_one_it_is_alone(device)
     np.testing.assert_allclose(weigh(TWO, points)[:, 1], second, atol=ROUNDING)
 
 
-def test_at_a_ball_no_other_has_a_weight(device):
-    np.testing.assert_allclose(weigh(THREE, [place[:3] for place in THREE]), np.eye(3), atol=ROUNDING)
-
-
 def test_twin_over_places_and_trusts(device):
     random = np.random.default_rng(4)
     for count in (2, 3, 5):
@@ -61,20 +57,6 @@ def test_twin_over_places_and_trusts(device):
         points = random.uniform(-0.6, 0.6, (40, 3))
         expected = [reference.weights(np.float32(places), np.float32(point)) for point in points]
         np.testing.assert_allclose(weigh(places, points), expected, atol=ROUNDING)
-
-
-def test_a_ball_goes_out_without_a_jump(device):
-    """Its weight falls with its trust, to zero at its own place too; the others share the room without it."""
-    places, at = np.array(THREE), [(0.15, 0.05, 0.0), (0.2, 0.0, 0.05)]
-    steps = []
-    for trust in np.linspace(1.0, 0.0, 41):
-        places[1, 3] = trust
-        steps.append(weigh(places, at))
-    steps = np.array(steps)
-    # Steepest at the ball's own place: of two others 1 - T is left, so it has T / (2 - T), whose slope is 2 at T = 1.
-    assert np.abs(np.diff(steps, axis=0)).max() < 2.0 / 40.0
-    np.testing.assert_allclose(steps[-1][:, [0, 2]], weigh(np.array(THREE)[[0, 2]], at), atol=ROUNDING)
-    assert (np.diff(steps[:, :, 1], axis=0) <= ROUNDING).all()
 
 
 def follow(shares, centers, *, seconds=0.1):
@@ -158,13 +140,6 @@ def test_light_is_the_weighted_mean_of_the_balls(device, form):
     expected = [reference.weights(THREE, point) @ radiances for point in points]
     np.testing.assert_allclose(look(radiances, points, form=form), np.stack([expected] * 2, 1), rtol=1e-5)
     np.testing.assert_array_equal(look(radiances, points, several=False), look((1.0, 1.0, 1.0), points))
-
-
-def test_a_room_that_is_alike_everywhere_stays_so(device):
-    """To the bit: weights do not come in where balls agree."""
-    points = np.random.default_rng(3).uniform(-0.4, 0.4, (30, 3))
-    found = look((0.7, 0.7, 0.7), points)
-    assert np.unique(found[:, 0]).size == np.unique(found[:, 1]).size == 1
 
 
 def test_before_any_ball_is_seen_the_first_one_holds(device):

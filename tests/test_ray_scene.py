@@ -16,10 +16,8 @@ from warp_ar import scene as scenes
 from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import EMPTY, screen_rects
-from warp_ar.scene.texture_pack import linear_texture
 
 CAMERA = scenes.Camera(width=64, height=48, fx=60.0, fy=62.0, cx=30.5, cy=24.0)
 BENT = dataclasses.replace(CAMERA, distortion=(-0.25, 0.08, 0.003, -0.002, 0.0))
@@ -84,22 +82,6 @@ def seen(shapes, pose, camera):
 # --- What is where ----------------------------------------------------------------------------------------------------
 
 
-def test_records_say_what_the_scene_says(device):
-    """Kinds, sizes, places, turned about the right axes; a torus is a mesh; everything has its material."""
-    host = HostScene(scenes.Scene(CAMERA, objects=OBJECTS, proxies=PROXIES), wp.get_device(device))
-    objects, proxies = records(host, "objects"), records(host, "proxies")
-    assert objects["kind"].tolist() == [structs.SPHERE, structs.BOX, structs.MESH]
-    assert proxies["kind"].tolist() == [structs.PLANE, structs.BOX]
-    assert objects["material"].tolist() == [0, 1, 2]
-    assert proxies["material"].tolist() == [-1, -1]
-    np.testing.assert_allclose(objects["extent"][1], [0.05, 0.1, 0.15], rtol=RECORD_TOLERANCE)
-    np.testing.assert_allclose(proxies["extent"][0], [0.5, 0.4, 0.0], rtol=RECORD_TOLERANCE)
-    np.testing.assert_allclose(objects["rotation"][1], rotation_matrix((10, 20, 30)), atol=RECORD_TOLERANCE)
-    np.testing.assert_allclose(objects["scale"], [2, 1, 0.5])
-    assert trace_config(host.scene).objects == (structs.BOX, structs.MESH, structs.SPHERE)
-    assert trace_config(host.scene).proxies == (structs.PLANE, structs.BOX)
-
-
 def test_mesh_is_moved_to_its_middle_and_back(device, tmp_path):
     """A mesh far from its own origin stands where the scene says, and keeps its digits."""
     triangle = np.array([[1000.0, 5, 5], [1001, 5, 5], [1000, 6, 7]])
@@ -144,33 +126,6 @@ def test_motion(device):
 
 
 # --- Materials --------------------------------------------------------------------------------------------------------
-
-
-def test_materials_and_textures(device, tmp_path):
-    """Each model's numbers arrive; a colour that is a picture becomes a texture in linear light, packed once."""
-    picture = np.array([[[255, 0, 128], [10, 20, 30]]], np.uint8)
-    path = tmp_path / "two.png"
-    cv2.imwrite(str(path), picture[..., ::-1])
-    materials = (
-        scenes.PhongMaterial(diffuse=path, specular=(0.1, 0.2, 0.3), shininess=9.0),
-        scenes.MetallicRoughnessMaterial(base_color=path, metallic=0.25, roughness=0.75),
-        scenes.LambertMaterial((0.1, 0.2, 0.3)),
-        scenes.MirrorMaterial((0.9, 0.9, 0.9)),
-    )
-    objects = tuple(scenes.Object("sphere", radius=1.0, material=material) for material in materials)
-    host = HostScene(scenes.Scene(CAMERA, objects=objects), wp.get_device(device))
-    values = records(host, "materials")
-    expected = [structs.PHONG, structs.METALLIC_ROUGHNESS, structs.LAMBERT, structs.MIRROR]
-    assert values["model"].tolist() == expected
-    assert values["base_texture"].tolist() == [0, 0, -1, -1]
-    assert values["specular_texture"].tolist() == [-1, -1, -1, -1]
-    np.testing.assert_allclose(values["base_color"], [[1, 1, 1], [1, 1, 1], [0.1, 0.2, 0.3], [0.9, 0.9, 0.9]])
-    assert (values["shininess"][0], values["metallic"][1], values["roughness"][1]) == (9.0, 0.25, 0.75)
-    np.testing.assert_allclose(values["specular"][0], [0.1, 0.2, 0.3])
-    texels = host.ray_scene.texels.numpy().view(np.uint8).reshape(-1, 4)
-    np.testing.assert_array_equal(texels[:2], np.concatenate([picture[0], np.full((2, 1), 255)], axis=1))
-    assert (records(host, "textures")["levels"].tolist(), len(texels)) == ([2], 3)
-    assert linear_texture(np.array([0, 255], np.uint8)).tolist() == [0.0, 1.0]
 
 
 def test_texture_needs_coordinates(device, tmp_path):

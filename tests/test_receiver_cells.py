@@ -1,7 +1,5 @@
 """Cells of the desk: the share of the environment that reaches them, and how pixels look cells up."""
 
-import math
-
 import numpy as np
 import pytest
 import trimesh
@@ -29,8 +27,6 @@ from tests.twins import relight as reference_relight
 from tests.twins.environment_shadow import sphere_form_factor
 from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels.environment import environment_samples
-from warp_ar.kernels.receiver.receiver import ReceiverCells
-from warp_ar.kernels.receiver.receiver_cells import Patch
 from warp_ar.kernels.structs import BOX, DIRECTIONAL, LAMBERT, MIRROR, PHONG, PLANE, filled
 from warp_ar.scene import Camera, Proxy, Scene
 from warp_ar.scene.ray_scene import HostScene
@@ -266,61 +262,6 @@ def test_reflectance_of_a_shaded_desk(device, share):
     kd = reference_relight.reflectance(radiance, share * np.pi)
     _, n_dot_l, e = reference_relight.point_light(POINTS, np.array([0, 0, 0.5]), 0.3)
     np.testing.assert_allclose(got, kd / np.pi * n_dot_l * e, rtol=2 * FLOAT_ERROR)
-
-
-def full(view, samples=None, strides=(4, 4, 4), rows=None):
-    """All passes, as the stage has them; (light, share, bounced) and the surfaces of both."""
-    samples = draw(sky())[2] if samples is None else samples
-    share = wp.full(view.cells(strides[0]), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3), wp.full(view.cells(strides[0]), 7)
-    share = share[0], wp.full(view.cells(strides[0]), 7, dtype=wp.int32)
-    for band in rows or [None]:
-        view.share(samples, strides[0], out=share, rows=band)
-    ambient = filled(frame_cells.SurfaceCells(), values=share[0], surface=share[1], stride=strides[0])
-    cells = filled(ReceiverCells(), ambient=ambient)
-    patches = wp.full(view.cells(strides[2]), Patch(), dtype=Patch)
-    for band in rows or [None]:
-        view.send(strides[2], out=patches, cells=cells, rows=band)
-    bounced = wp.full(view.cells(strides[1]), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3)
-    bounced = bounced, wp.full(view.cells(strides[1]), 7, dtype=wp.int32)
-    view.gather(patches, strides[2], strides[1], out=bounced, rows=rows)
-    cells.bounced = filled(frame_cells.SurfaceCells(), values=bounced[0], surface=bounced[1], stride=strides[1])
-    for band in rows or [None]:
-        view.share(samples, strides[0], out=share, cells=cells, bounced=True, rows=band)
-    return [view.light(cells), *(array.numpy() for array in (*share, *bounced))]
-
-
-def tilted():
-    """From the front and above: world_from_camera of a camera at (0, -0.5, 0.4) that looks at (0, 0.1, 0)."""
-    forward = np.array([0, 0.6, -0.4]) / math.hypot(0.6, 0.4)
-    right = np.array([1.0, 0, 0])
-    return {"camera": (0, -0.5, 0.4), "turn": np.stack([right, np.cross(forward, right), forward], -1)}
-
-
-SPOT_ON_DESK = {
-    "kind": 2,
-    "position": (0, 0.0, 0.4),
-    "direction": (0, 0, -1),
-    "intensity": (2.0,) * 3,
-    "attenuation": (0, 0, 1),
-    "inner_angle": 0.25,
-    "outer_angle": 0.3,
-}
-WALL = {**shape(PLANE, (0, 0.2, 0.2), (0.3, 0.2, 0)), "rotation": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])}
-
-
-def test_a_lit_floor_lights_the_wall_and_not_itself(device):
-    view = View((DESK, WALL), lights=[SPOT_ON_DESK], ambient_visibility=True, bounced=True, **tilted())
-    light, _, _, bounced, surface = full(view)
-    assert (bounced[surface == 0] == 0).all()
-    assert (bounced[surface == 8] > 0).mean() > 0.9
-    plain = view.light(ambient_visibility=False, bounced=False)
-    on_wall = (surface == 8).repeat(4, 0).repeat(4, 1) & (plain.sum(-1) == 0)
-    assert (light[on_wall] > 0).mean() > 0.8
-    # Patches a quarter as long say the same, but at the edge: a patch next to it is one point.
-    fine = full(view, strides=(4, 4, 1))[3]
-    far = (surface == 8) & (np.roll(surface, -3, 0) == 8)
-    assert far.sum() > 20
-    np.testing.assert_allclose(bounced[far], fine[far], rtol=0.1)
 
 
 MATERIALS = {

@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 from tests.error_model import check_error
 from tests.kernel_rig import constant_environment, shape
-from tests.relight_rig import CAMERA, FLOAT_ERROR, HALF_CODE, POINTS, PRIOR, RIM, H, W, noise_frame, point, run, unit
+from tests.relight_rig import CAMERA, FLOAT_ERROR, POINTS, PRIOR, RIM, H, W, noise_frame, point, run, unit
 from tests.twins import color as reference_color
 from tests.twins import relight as reference
 from warp_ar.kernels import color
-from warp_ar.kernels.receiver.receiver import METHODS, READINGS, text_response
+from warp_ar.kernels.receiver.receiver import METHODS, READINGS
 from warp_ar.kernels.structs import DIRECTIONAL, SPHERE
 
 # --- closed forms
@@ -23,21 +22,6 @@ def test_white_desk_has_the_value_of_the_scene_format(device):
     _, n_dot_l, e = reference.point_light(POINTS, np.array([0, 0, 0.25]), 0.3)
     np.testing.assert_allclose(got, np.broadcast_to(n_dot_l * e / np.pi, got.shape), rtol=PRIOR + FLOAT_ERROR)
     assert got.max() == pytest.approx(0.3 / (np.pi * 0.25**2), rel=5e-3)  # no pixel is exactly under the light
-
-
-@pytest.mark.parametrize("rho", [0.1, 0.5, 0.9])
-def test_reflectance_of_a_lambertian_desk_is_recovered(device, rho):
-    """Whatever the environment: L = rho E / pi is what the camera sees."""
-    surroundings = np.array([0.9, 0.6, 0.3])
-    code = reference_color.encode(rho * surroundings, reference_color.encoded_srgb)
-    got = run(
-        "reflectance",
-        [point((0, 0, 0.25))],
-        np.broadcast_to(code, (H, W, 3)).copy(),
-        sh=constant_environment(surroundings),
-    )
-    _, n_dot_l, e = reference.point_light(POINTS, np.array([0, 0, 0.25]), 0.3)
-    np.testing.assert_allclose(got, np.broadcast_to(rho / np.pi * n_dot_l * e, got.shape), rtol=HALF_CODE)
 
 
 def test_frames_of_more_than_8_bits_reflect_as_they_are(device):
@@ -86,23 +70,6 @@ def test_paper_in_its_three_cases_by_hand(device, case, directionality):
     arriving = 0.5 / np.pi * np.array([0.5, 0.4, 0.3])
     np.testing.assert_allclose(got[:, 1::2], np.broadcast_to(dark * arriving, got[:, 1::2].shape), rtol=FLOAT_ERROR)
     np.testing.assert_allclose(got[:, ::2], np.broadcast_to(bright * arriving, got[:, ::2].shape), rtol=FLOAT_ERROR)
-
-
-@wp.kernel(enable_backward=False)
-def response_kernel(n_dot_l: wp.float32, m: wp.float32, alpha: wp.array[wp.float32], text_out: wp.array[wp.float32]):
-    i = wp.tid()
-    text_out[i] = text_response(n_dot_l, m, alpha[i])
-
-
-@pytest.mark.parametrize("m", [0.0, 0.2, 0.8, 1.0])
-def test_responses_are_continuous_and_never_negative(device, m):
-    alpha = np.linspace(-1.0, 1.0, 2001)
-    values = wp.zeros(alpha.shape, dtype=wp.float32)
-    wp.launch(response_kernel, alpha.shape, [0.7, m, wp.array(alpha, dtype=wp.float32)], [values])
-    text = values.numpy()
-    assert np.abs(np.diff(text)).max() < 4e-3  # slope at most 1, and a kink
-    assert (text >= 0.0).all()
-    np.testing.assert_allclose(text, reference.text_response(0.7, m, alpha), atol=1e-6)
 
 
 # --- twins

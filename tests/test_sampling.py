@@ -15,31 +15,6 @@ SIGNIFICANCE = 1e-4
 ROUNDING = 1e-5
 
 
-@wp.kernel(enable_backward=False)
-def hash_kernel(values: wp.array[wp.vec3ui], triple_out: wp.array[wp.vec3ui]):
-    i = wp.tid()
-    triple_out[i] = sampling.pcg3d_hash(values[i][0], values[i][1], values[i][2])
-
-
-@wp.kernel(enable_backward=False)
-def uniform_kernel(bits: wp.array[wp.uint32], inverse_out: wp.array[wp.float32], uniform_out: wp.array[wp.float32]):
-    i = wp.tid()
-    inverse_out[i] = sampling.radical_inverse(bits[i])
-    uniform_out[i] = sampling.uniform_from_bits(bits[i])
-
-
-@wp.kernel(enable_backward=False)
-def hammersley_kernel(out: wp.array[wp.vec2]):
-    i = wp.tid()
-    out[i] = sampling.hammersley(i, out.shape[0])
-
-
-@wp.kernel(enable_backward=False)
-def frame_kernel(normals: wp.array[wp.vec3], out: wp.array[wp.mat33]):
-    i = wp.tid()
-    out[i] = sampling.frame_from_normal(normals[i])
-
-
 DISK, COSINE, PHONG, GGX, VISIBLE = range(5)
 
 
@@ -107,48 +82,6 @@ def view(cosine):
 # --- Numbers ----------------------------------------------------------------------------------------------------------
 
 
-def test_hashed_numbers_are_uniform(device):
-    grid = np.stack(np.meshgrid(np.arange(64), np.arange(64), np.arange(16), indexing="ij"), -1).reshape(-1, 3)
-    triple = wp.zeros(len(grid), dtype=wp.vec3ui)
-    wp.launch(hash_kernel, len(grid), [wp.array(grid.astype(np.uint32), dtype=wp.vec3ui)], [triple])
-    for bits in triple.numpy().T:
-        assert stats.chisquare(np.bincount(bits >> 24, minlength=256)).pvalue > SIGNIFICANCE
-    joint = np.bincount((triple.numpy()[:, 0] >> 28) * 16 + (triple.numpy()[:, 1] >> 28), minlength=256)
-    assert stats.chisquare(joint).pvalue > SIGNIFICANCE
-
-
-def test_radical_inverse_mirrors_bits_and_stays_below_one(device):
-    bits = np.concatenate([np.arange(5000), [2**31, 2**32 - 1, 0x80000001]]).astype(np.uint32)
-    inverse, uniform = wp.zeros(len(bits), dtype=wp.float32), wp.zeros(len(bits), dtype=wp.float32)
-    wp.launch(uniform_kernel, len(bits), [wp.array(bits, dtype=wp.uint32)], [inverse, uniform])
-    # 24 of 32 bits are kept.
-    np.testing.assert_allclose(inverse.numpy(), [reference.radical_inverse(int(b)) for b in bits], atol=2.0**-24)
-    assert inverse.numpy().max() < 1
-    assert uniform.numpy().max() < 1
-
-
-@pytest.mark.parametrize("count", [1, 8, 32, 128, 1024])
-def test_hammersley_fills_every_stratum_once(device, count):
-    out = wp.zeros(count, dtype=wp.vec2)
-    wp.launch(hammersley_kernel, count, [], [out])
-    points = out.numpy()
-    assert ((points > 0) & (points < 1)).all()
-    for axis in (0, 1):  # powers of two: both axes are stratified
-        assert sorted((points[:, axis] * count).astype(int)) == list(range(count))
-
-
-def test_frames_are_orthonormal_everywhere(device):
-    normals = np.random.default_rng(3).standard_normal((1000, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals[:4] = [[0, 0, 1], [0, 0, -1], [1e-8, 0, -1], [1, 0, 0]]
-    out = wp.zeros(1000, dtype=wp.mat33)
-    wp.launch(frame_kernel, 1000, [wp.array(normals.astype(np.float32), dtype=wp.vec3)], [out])
-    frames = out.numpy().astype(np.float64)
-    np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=2e-6)
-    np.testing.assert_allclose(frames[:, :, 2], normals, atol=1e-7)
-    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=2e-6)
-
-
 # --- Distributions: histograms against pdfs ---------------------------------------------------------------------------
 
 
@@ -185,18 +118,6 @@ def test_phong_samples_follow_their_pdf(device, exponent):
 @pytest.mark.parametrize("alpha", [0.1, 0.4, 1.0])
 def test_visible_ggx_samples_follow_their_pdf(device, alpha, cosine):
     histogram_test(VISIBLE, alpha, view(cosine))
-
-
-def test_hemisphere_and_disk_have_their_moments(device):
-    limit = 5 / math.sqrt(COUNT)
-    w, _ = draw(COSINE)
-    assert w[:, 2].mean() == pytest.approx(2 / 3, abs=limit * 0.24)
-    assert (w[:, 2] ** 2).mean() == pytest.approx(1 / 2, abs=limit * 0.3)
-    p, _ = draw(DISK)
-    assert (np.hypot(p[:, 0], p[:, 1]) ** 2).mean() == pytest.approx(1 / 2, abs=limit * 0.3)
-    np.testing.assert_allclose(p[:, :2].mean(0), 0, atol=limit * 0.5)
-    angle = ((np.arctan2(p[:, 1], p[:, 0]) + np.pi) / (2 * np.pi) * 32).astype(int) % 32
-    assert stats.chisquare(np.bincount(angle, minlength=32)).pvalue > SIGNIFICANCE
 
 
 # --- Formulas and their ends ------------------------------------------------------------------------------------------

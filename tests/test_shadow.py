@@ -19,7 +19,7 @@ from warp_ar.kernels.rays.shadow import (
     make_visible_share,
     sample_light,
 )
-from warp_ar.kernels.structs import BOX, DIRECTIONAL, POINT, SPHERE, SPOT, Light, RayScene, Shape
+from warp_ar.kernels.structs import BOX, DIRECTIONAL, POINT, SPOT, Light, RayScene, Shape
 
 # A dozen float32 roundings; a spot's fall divides the angle's rounding (1e-7) by the width of its rim.
 TOLERANCE = 2e-6
@@ -157,15 +157,6 @@ def test_shadow_of_a_sphere(device, proxies):
     assert lit(scene, light(position=(0, 0, 0.5)), [(0, 0, 0)], device) == [1]
 
 
-def test_light_inside_an_object_and_on_a_surface(device):
-    """A closed object keeps the light inside it in; a light on the surface itself shines."""
-    scene = World(device).add("sphere", extent=(0.1, 0.1, 0.1), at=(0, 0, 1)).scene()
-    assert lit(scene, light(position=(0, 0, 1)), [(0, 0, 0), (0, 0, 1.05)], device) == [0, 1]
-    ground = World(device).add("plane", extent=(1, 1, 0)).scene(proxies=True)
-    assert lit(ground, light(position=(0, 0, 0)), [(0, 0, 0), (0.5, 0, 0)], device) == [1, 1]
-    assert lit(ground, light(position=(0.3, 0, 1)), [(0, 0, 0), (0.5, 0, 0)], device) == [1, 1]
-
-
 # --- Sized lights -----------------------------------------------------------------------------------------------------
 
 
@@ -214,13 +205,6 @@ def test_half_plane_hides_the_area_that_it_covers(device, turn):
     np.testing.assert_allclose(got, expected, atol=SUNFLOWER)
     assert got[0] == 1
     assert got[-1] == 0
-
-
-def test_points_and_enclosing_lights_are_seen_or_not(device):
-    ball = [(SPHERE, (0, 0, 0.5), (0.1, 0, 0))]
-    points = [(0, 0, 0), (0.5, 0, 0)]
-    assert shares(points, 0.0, ball).tolist() == [0, 1]
-    assert shares([(0, 0, 0.99)], 0.1).tolist() == [1]
 
 
 def test_light_at_the_horizon_is_half_set(device):

@@ -46,11 +46,6 @@ def white(height, width):
     return np.full((height, width, 3), 255, np.uint8)
 
 
-def test_intensity_of_grey_is_its_value(device):
-    grey = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    np.testing.assert_array_equal(make_table(grey).numpy()[0], np.arange(256).cumsum())
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 1), (63, 64), (130, 257)])
 def test_matches_twin(device, size):
     frame = random_frame(*size)

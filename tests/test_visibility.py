@@ -10,12 +10,10 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.hard_cases.generators import closed_sphere
-from tests.kernel_rig import records
 from tests.twins import visibility as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.rays.shapes import FAR
 from warp_ar.kernels.rays.trace import TraceConfig, make_trace, offset_origin
-from warp_ar.kernels.rays.visibility import make_visible, trace_pixels
 from warp_ar.kernels.structs import Hit
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_mesh import make_ray_mesh
@@ -342,47 +340,3 @@ def test_rays_that_leave_do_not_come_back(device, kind, size, distance):
 
 
 # --- Frames -----------------------------------------------------------------------------------------------------------
-
-
-def camera(device, *, rect, eye=(0.0, 0.0, 0.0), size=(48, 64), focal=60.0):
-    """Frame values and rays of a camera at ``eye`` that looks along +z."""
-    place = {"camera_position": eye, "world_from_camera": np.eye(3), "focal": focal, "object_rect": rect}
-    x, y = np.meshgrid((np.arange(size[1]) - 31.5) / focal, (np.arange(size[0]) - 23.5) / focal)
-    return (
-        records(structs.FrameParams, place, device=device),
-        wp.array(np.stack([x, y], -1).astype(np.float32), dtype=wp.vec2, device=device),
-    )
-
-
-def frame_of(scene, device, *, rect, bands=(None,)):
-    params, rays = camera(device, rect=rect)
-    found = wp.full(rays.shape, 7, dtype=wp.int32, device=device)
-    hits = wp.zeros(rays.shape, dtype=Hit, device=device)
-    for rows in bands:
-        trace_pixels(GENERAL, params, rays, scene, make_visible(found, hits), rows=rows)
-    return found.numpy(), hits.numpy()
-
-
-def test_frame(device):
-    """t is the depth along the camera's axis; outside the rectangle nothing is found; bands make the whole."""
-    scene = World(device).add("sphere", extent=(0.5, 0.5, 0.5), at=(0, 0, 2)).add("box", at=(0, 0, 5), extent=(9, 9, 1))
-    scene = scene.scene()
-    found, hits = frame_of(scene, device, rect=(0, 48, 0, 64))
-    depth = hits["t"]
-    assert set(np.unique(found)) == {0, 1}
-    np.testing.assert_allclose(depth[found == 1], 4.0, rtol=1e-6)
-    assert depth[24, 32] == pytest.approx(1.5, abs=1e-3)
-    seen = found >= 0
-    np.testing.assert_allclose(hits["point"][seen, 2], depth[seen], rtol=1e-5)
-    # The ball's outline: half angle asin(0.5 / 2), area pi (60 tan)^2.
-    assert (found == 0).sum() == pytest.approx(np.pi * (60 * np.tan(np.arcsin(0.25))) ** 2, rel=0.02)
-
-    part, _ = frame_of(scene, device, rect=(10, 20, 30, 40))
-    outside = np.ones(part.shape, bool)
-    outside[10:20, 30:40] = False
-    assert (part[outside] == -1).all()
-    np.testing.assert_array_equal(part[~outside], found[~outside])
-
-    banded, banded_hits = frame_of(scene, device, rect=(0, 48, 0, 64), bands=((0, 11), (11, 40), (40, 48)))
-    np.testing.assert_array_equal(banded, found)
-    np.testing.assert_array_equal(banded_hits, hits)
