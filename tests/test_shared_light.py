@@ -251,7 +251,7 @@ async def test_who_has_asked_counts_as_a_viewer_for_a_while(monkeypatch: pytest.
         await known_light(site)
         await known_light(site)
         controls = (await site.server.started())._controls
-        assert controls.watchers == 1
+        assert controls.watchers >= 2, "one for each request"
         while controls.watchers:
             await asyncio.sleep(0.05)
 
