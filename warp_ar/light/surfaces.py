@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from warp_ar.kernels.recovery.recover import SurfacePoint
 from warp_ar.kernels.structs import struct_dtype
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.scene import Proxy, Scene
+from warp_ar.scene import Marker, Probe, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.tracking.markers import printed_cells
 
@@ -60,6 +61,15 @@ class _Collector:
         return Surfaces(points, surface, kinds, np.array(self.groups), overlap)
 
 
+class _Known(NamedTuple):
+    """Parts of a scene on which the points depend."""
+
+    marker: Marker
+    has_marker: bool
+    probes: tuple[Probe, ...]
+    proxies: tuple[Proxy, ...]
+
+
 def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     """Return points on all physical surfaces that the scene models: the printed card, planes and boxes.
 
@@ -72,6 +82,12 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
         scene: Scene with the surfaces.
         card_only: Whether to return only points of the card's paper and ink.
     """
+    return _find_surfaces(_Known(scene.marker, scene.has_marker, scene.probes, scene.proxies), card_only)
+
+
+@functools.lru_cache(maxsize=4)
+def _find_surfaces(scene: _Known, card_only: bool) -> Surfaces:
+    """Return ``find_surfaces``; an edit of virtual objects finds it in the cache."""
     found = _Collector()
     cells, white, side, outline = printed_cells(scene.marker)
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
@@ -97,7 +113,7 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     return found.result()
 
 
-def _largest(scene: Scene, shape: str, most: int) -> set[int]:
+def _largest(scene: _Known, shape: str, most: int) -> set[int]:
     """Return indices of the ``most`` proxies of a shape that look largest from the first ball."""
     # A proxy with its own marker moves, so that a point on it is not the same in the next frame.
     still = ((number, proxy) for number, proxy in enumerate(scene.proxies) if proxy.marker is None)
@@ -124,7 +140,7 @@ def _quiet_zone(low: Array, high: Array, side: float) -> Array:
     return np.column_stack([ring, np.zeros(len(ring))])
 
 
-def _plane_points(scene: Scene, plane: Proxy, low: Array, high: Array) -> Array:
+def _plane_points(scene: _Known, plane: Proxy, low: Array, high: Array) -> Array:
     """Return points on a plane outside the card and outside boxes, (n, 3).
 
     Args:
@@ -167,7 +183,7 @@ def _add_box(found: _Collector, box: Proxy, steps: int, group: int) -> None:
             found.add(list(at + face @ rotation.T), sign * rotation[:, axis], rotation[:, u], size, Kind.FACE, group)
 
 
-def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
+def _in_boxes(scene: _Known, points: Array) -> NDArray[np.bool_]:
     inside = np.zeros(len(points), bool)
     for proxy in scene.proxies:
         if proxy.shape == "box" and proxy.marker is None:
