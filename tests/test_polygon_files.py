@@ -185,7 +185,7 @@ def test_alpha_of_colours_is_shown(
 def test_colours_of_a_ply_under_other_names(tmp_path: pathlib.Path, names: str) -> None:
     declared = "".join(f"property uchar {name}\n" for name in names.split())
     (tmp_path / "a.ply").write_bytes(ply("ascii", [(*p, 255, 0, 0) for p in SQUARE], [((0, 1, 2), ())], declared, ""))
-    np.testing.assert_allclose(load_mesh(tmp_path / "a.ply").colors[:, :3], [(1, 0, 0)] * 4)
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.ply").colors[:, :3], [(1, 0, 0)] * 3)
 
 
 def test_each_face_of_a_ply_has_the_texture_of_its_number(tmp_path: pathlib.Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -38,9 +38,13 @@ colours."""
 
 
 @dataclasses.dataclass
-class Corners:
+class Polygons:
     """Polygons as a list of corners, with the attributes of corners, polygons and vertices."""
 
+    source: MeshSource
+    """The file."""
+    vertices: Array
+    """Positions, (v, 3)."""
     vertex: Indices
     """Vertex index of each corner, (n,)."""
     lengths: Indices
@@ -58,39 +62,92 @@ class Corners:
     vertex_color: Array | None = None
     """Linear RGBA of each vertex, (v, 4)."""
 
-    def check(self, source: MeshSource, count: int) -> None:
-        """Check that all corners refer to the ``count`` vertices, and spread vertex attributes to the corners.
+    def parts(
+        self,
+        groups: Indices | None = None,
+        materials: Mapping[int, MeshMaterial] | None = None,
+        crease: float | None = CREASE,
+    ) -> list[MeshPart]:
+        """Cut the polygons into triangles, and return a part of a mesh for each group of polygons that gives any.
+
+        Args:
+            groups: Group number of each polygon, (p,); None: all are one group.
+            materials: Materials by group number; a group without one has none.
+            crease: Angle in degrees above which an edge is sharp if the file has no normals; None: no edge is sharp.
 
         Raises:
-            SceneError: A vertex index is out of range.
+            SceneError: A vertex is not finite, or a vertex index is out of range.
         """
-        index = self.vertex
-        check_indices(f"{source.path}", index, count)
+        check_indices(f"{self.source.path}", self.vertex, len(self.vertices))
         if self.uv is None and self.vertex_uv is not None:
-            self.uv = self.vertex_uv[index]
+            self.uv = self.vertex_uv[self.vertex]
         if self.normal is None and self.vertex_normal is not None:
-            self.normal = self.vertex_normal[index]
+            self.normal = self.vertex_normal[self.vertex]
+        triangles, owners = triangles_of(self)
+        own = np.zeros(len(owners), np.int64) if groups is None else groups[owners]
+        parts = []
+        for number in np.unique(own).tolist():
+            chosen = own == number
+            parts.append(self._part(triangles[chosen], owners[chosen], (materials or {}).get(number), crease))
+        return parts
+
+    def _part(
+        self, triangles: Indices, owners: Indices, material: MeshMaterial | None, crease: float | None
+    ) -> MeshPart:
+        """Return some triangles, in the form of `triangles_of`, as a part of a mesh."""
+        flat = triangles.ravel()
+        index = self.vertex[flat]
+        face = None if self.color is None else np.repeat(self.color[owners], 3, 0)
+        of_corners = [values[flat] for values in (self.uv, self.normal) if values is not None]
+        of_corners += [] if face is None else [face]
+        keys: npt.NDArray[Any] = index
+        if of_corners:
+            rows = np.column_stack([index.astype(np.float64), *of_corners])
+            rows = np.ascontiguousarray(np.where(np.isfinite(rows), rows, 0.0) + 0.0)
+            keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
+        _, first, faces = np.unique(keys, return_index=True, return_inverse=True)
+        if of_corners:
+            order = np.argsort(first)  # in the order of the file
+            first, faces = first[order], np.argsort(order)[faces]
+        where = index[first]
+
+        def taken(values: Array | None) -> Array | None:
+            return None if values is None else values[flat][first]
+
+        colors = None if self.vertex_color is None else self.vertex_color[where]
+        if face is not None:
+            colors = face[first] if colors is None else colors * face[first]
+        if colors is not None and (colors[:, 3] < 1.0).any():
+            material = material or MeshMaterial(surface=LambertMaterial((1.0, 1.0, 1.0)))
+            material = dataclasses.replace(material, alpha="blend") if material.alpha == "opaque" else material
+        return MeshPart.checked(
+            f"{self.source.path}",
+            self.vertices[where],
+            faces.reshape(-1, 3).astype(np.int64),
+            taken(self.normal),
+            uvs=(taken(self.uv), None),
+            colors=colors,
+            material=material,
+            crease=crease,
+        )
 
 
-def triangles_of(vertices: Array, corners: Corners) -> tuple[Indices, Indices]:
-    """Cut polygons into triangles.
-
-    Args:
-        vertices: (v, 3).
-        corners: The polygons; polygons with fewer than three corners give no triangle.
+def triangles_of(polygons: Polygons) -> tuple[Indices, Indices]:
+    """Cut polygons into triangles; those with fewer than three corners give none.
 
     Returns:
         Corner indices of the triangles, (m, 3), and the polygon index of each triangle, (m,).
     """
-    starts = np.cumsum(corners.lengths) - corners.lengths
+    lengths = polygons.lengths
+    starts = np.cumsum(lengths) - lengths
     found: list[Indices] = []
     owners: list[Indices] = []
-    for count in np.unique(corners.lengths[corners.lengths >= 3]).tolist():
-        which = np.flatnonzero(corners.lengths == count)
+    for count in np.unique(lengths[lengths >= 3]).tolist():
+        which = np.flatnonzero(lengths == count)
         places = starts[which, None] + np.arange(count)
         bent = np.zeros(len(which), bool)
         if count > 3:
-            points = vertices[corners.vertex[places]]
+            points = polygons.vertices[polygons.vertex[places]]
             after = np.roll(points, -1, 1) - points
             turns = np.cross(np.roll(after, 1, 1), after)
             normals = np.cross(points - points[:, :1], np.roll(points, -1, 1) - points[:, :1]).sum(1)
@@ -147,83 +204,6 @@ def clip_ears(points: Array) -> Indices:
         else:
             at, tries = (at + 1) % count, tries + 1
     return np.array([*cut, tuple(left)], np.int64)
-
-
-def part_of(
-    source: MeshSource,
-    vertices: Array,
-    corners: Corners,
-    cut: tuple[Indices, Indices],
-    *,
-    material: MeshMaterial | None = None,
-    crease: float | None = CREASE,
-    whole: bool = True,
-) -> MeshPart | None:
-    """Return some triangles of polygons as a part of a mesh; None if there are none.
-
-    Args:
-        source: The file.
-        vertices: (v, 3).
-        corners: The polygons, checked.
-        cut: Triangles of this part, in the form of `triangles_of`.
-        material: Material of the part.
-        crease: Angle in degrees above which an edge is sharp if the file has no normals; None: no edge is sharp.
-        whole: True if all vertices belong to this part.
-
-    Raises:
-        SceneError: A vertex is not finite.
-    """
-    triangles, owners = cut
-    if not len(triangles):
-        return None
-    flat = triangles.ravel()
-    index = corners.vertex[flat]
-    face = None if corners.color is None else np.repeat(corners.color[owners], 3, 0)
-    of_corners = [values[flat] for values in (corners.uv, corners.normal) if values is not None]
-    of_corners += [] if face is None else [face]
-    first = None
-    if of_corners:
-        rows = np.column_stack([index.astype(np.float64), *of_corners])
-        rows = np.ascontiguousarray(np.where(np.isfinite(rows), rows, 0.0) + 0.0)
-        keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
-        _, first, faces = np.unique(keys, return_index=True, return_inverse=True)
-        order = np.argsort(first)  # in the order of the file
-        first, faces = first[order], np.argsort(order)[faces]
-        where = index[first]
-    elif whole:
-        where, faces = np.arange(len(vertices)), index
-    else:
-        where, faces = np.unique(index, return_inverse=True)
-
-    def taken(values: Array | None) -> Array | None:
-        return None if values is None else values[flat][first]
-
-    colors = None if corners.vertex_color is None else corners.vertex_color[where]
-    if face is not None:
-        colors = face[first] if colors is None else colors * face[first]
-    if colors is not None and (colors[:, 3] < 1.0).any():
-        material = material or MeshMaterial(surface=LambertMaterial((1.0, 1.0, 1.0)))
-        material = dataclasses.replace(material, alpha="blend") if material.alpha == "opaque" else material
-    return MeshPart.checked(
-        f"{source.path}",
-        vertices[where],
-        faces.reshape(-1, 3).astype(np.int64),
-        taken(corners.normal),
-        uvs=(taken(corners.uv), None),
-        colors=colors,
-        material=material,
-        crease=crease,
-    )
-
-
-def parts_of(source: MeshSource, vertices: Array, corners: Corners, **how: Any) -> list[MeshPart]:
-    """Return all triangles of polygons as a list of one part, or an empty list.
-
-    Arguments and errors are those of `part_of`.
-    """
-    corners.check(source, len(vertices))
-    part = part_of(source, vertices, corners, triangles_of(vertices, corners), **how)
-    return [] if part is None else [part]
 
 
 def linear_rgba(values: Array, largest: float) -> Array:
@@ -303,27 +283,25 @@ class _Obj:
 
     def parts(self) -> list[MeshPart]:
         """Return a part for each material."""
+        faces = np.array(self._faces, np.int64).reshape(-1, 5)
+        indices = self._indices()
+        before = np.repeat(faces[:, 2:], faces[:, 0], 0)
+        indices = np.where(indices < 0, indices + before, indices - 1)
         vertices, colors = self._vertices()
-        corners, materials = self._corners()
-        corners.vertex_color = colors
-        corners.check(self._source, len(vertices))
+        polygons = Polygons(self._source, vertices, indices[:, 0], faces[:, 0], vertex_color=colors)
+        polygons.uv = self._attribute("vt", indices[:, 1], 2)
+        polygons.normal = self._attribute("vn", indices[:, 2], 3)
         library = self._library()
-        if self._smooth and corners.normal is None:
+        if self._smooth and polygons.normal is None:
             self._source.note(f"smoothing groups without normals: edges of more than {CREASE:g} degrees are sharp")
-        triangles, owners = triangles_of(vertices, corners)
-        found = []
+        found = {}
         for name, number in self._materials.items():
-            chosen = materials[owners] == number
             values = library.get(name)
             if name and values is None and library:
                 self._source.note(f"the material {name[:60]}, which no library has")
-            material = None
-            if values is not None and chosen.any():
-                material = read_library(self._source, values)
-            cut = triangles[chosen], owners[chosen]
-            part = part_of(self._source, vertices, corners, cut, material=material, whole=bool(chosen.all()))
-            found += [] if part is None else [part]
-        return found
+            if values is not None and (faces[:, 1] == number).any():
+                found[number] = read_library(self._source, values)
+        return polygons.parts(faces[:, 1], found)
 
     def _vertices(self) -> tuple[Array, Array | None]:
         """Return positions and linear colours of vertices, written as x y z [w] or x y z r g b [a]."""
@@ -337,16 +315,6 @@ class _Obj:
         values = np.array(list(told), np.float64)
         largest = _white(values[:, :3], False)
         return vertices, _shown_colors(self._source, np.where(np.isnan(values), largest, values), largest)
-
-    def _corners(self) -> tuple[Corners, Indices]:
-        faces = np.array(self._faces, np.int64).reshape(-1, 5)
-        indices = self._indices()
-        before = np.repeat(faces[:, 2:], faces[:, 0], 0)
-        indices = np.where(indices < 0, indices + before, indices - 1)
-        corners = Corners(indices[:, 0], faces[:, 0])
-        corners.uv = self._attribute("vt", indices[:, 1], 2)
-        corners.normal = self._attribute("vn", indices[:, 2], 3)
-        return corners, faces[:, 1]
 
     def _indices(self) -> Indices:
         """Return the indices v, vt, vn of each corner as the file counts them, (n, 3); 0 if missing."""
@@ -409,29 +377,30 @@ def read_off(source: MeshSource) -> list[MeshPart]:
         lines = lines if lines[0] else lines[1:]
     if not lines or "BINARY" in lines[0] or (kind is not None and (kind[4] or kind[5])):
         raise ValueError("no OFF of text in three dimensions")
-    count, polygons = int(lines[0][0]), int(lines[0][1])
+    count, total = int(lines[0][0]), int(lines[0][1])
     source.check_count(count, 1)
-    source.check_count(polygons, 1)
-    rows, faces = lines[1 : 1 + count], lines[1 + count : 1 + count + polygons]
-    if len(rows) < count or len(faces) < polygons:
+    source.check_count(total, 1)
+    rows, faces = lines[1 : 1 + count], lines[1 + count : 1 + count + total]
+    if len(rows) < count or len(faces) < total:
         raise ValueError(f"cut off after {len(lines)} lines")
     wide = min(map(len, rows), default=3)
     values = np.array([row[:wide] for row in rows], np.float64).reshape(-1, wide)
     lengths = np.array([int(face[0]) for face in faces], np.int64)
     if any(len(face) < 1 + length for face, length in zip(faces, lengths.tolist(), strict=True)):
         raise ValueError("a face has fewer corners than it says")
-    corners = Corners(np.array([int(word) for face in faces for word in face[1 : 1 + int(face[0])]], np.int64), lengths)
+    indices = np.array([int(word) for face in faces for word in face[1 : 1 + int(face[0])]], np.int64)
+    polygons = Polygons(source, values[:, :3], indices, lengths)
     at = 3
     if kind is not None and kind[3]:
-        corners.vertex_normal, at = values[:, 3:6], 6
+        polygons.vertex_normal, at = values[:, 3:6], 6
     rest = wide - at - (2 if kind is not None and kind[1] else 0)
     if rest >= 3:
         whole = not any(re.search(r"[.eE]", word) for row in rows for word in row[at : at + 3])
         given = values[:, at : at + min(rest, 4)]
-        corners.vertex_color = _shown_colors(source, given, _white(given[:, :3], whole))
+        polygons.vertex_color = _shown_colors(source, given, _white(given[:, :3], whole))
         at += min(rest, 4)
     if kind is not None and kind[1] and wide >= at + 2:
-        corners.vertex_uv = values[:, at : at + 2]
+        polygons.vertex_uv = values[:, at : at + 2]
     extra = [face[1 + int(face[0]) :] for face in faces]
     if any(len(words) >= 3 for words in extra):
         whole = not any(re.search(r"[.eE]", word) for words in extra for word in words[:3])
@@ -439,11 +408,11 @@ def read_off(source: MeshSource) -> list[MeshPart]:
         told = np.array([[*words[:4], "nan"][:4] if len(words) >= 3 else ("-1",) * 4 for words in extra], np.float64)
         white = _white(told[:, :3], whole)
         told[:, 3] = np.where(np.isnan(told[:, 3]), white, told[:, 3])
-        corners.color = _shown_colors(source, told, white)
-        corners.color[told[:, 0] < 0.0] = _UNCOLORED
+        polygons.color = _shown_colors(source, told, white)
+        polygons.color[told[:, 0] < 0.0] = _UNCOLORED
     elif any(extra):
         source.note("colours of faces by their number in a table")
-    return parts_of(source, values[:, :3], corners)
+    return polygons.parts()
 
 
 def read_stl(source: MeshSource) -> list[MeshPart]:
@@ -476,7 +445,7 @@ def read_stl(source: MeshSource) -> list[MeshPart]:
             source.note("colours of triangles")
         if len(data) > 84 + 50 * count:
             source.note("bytes behind the last triangle")
-    return parts_of(source, vertices, Corners(np.arange(len(vertices)), lengths))
+    return Polygons(source, vertices, np.arange(len(vertices)), lengths).parts()
 
 
 def _white(values: Array, whole: bool) -> float:
@@ -642,14 +611,14 @@ def read_ply(source: MeshSource) -> list[MeshPart]:
         source.note("strips of triangles beside faces")
     if vertices is None or listed is None:
         return []
-    corners = Corners(listed[0].astype(np.int64), listed[1])
-    corners.vertex_normal, _ = ply.columns("vertex", (("nx", "ny", "nz"),))
-    corners.vertex_uv, _ = ply.columns("vertex", _PLY_UVS)
-    corners.vertex_color, corners.color = ply.colors("vertex"), ply.colors("face") if faces else None
+    polygons = Polygons(source, vertices, listed[0].astype(np.int64), listed[1])
+    polygons.vertex_normal, _ = ply.columns("vertex", (("nx", "ny", "nz"),))
+    polygons.vertex_uv, _ = ply.columns("vertex", _PLY_UVS)
+    polygons.vertex_color, polygons.color = ply.colors("vertex"), ply.colors("face") if faces else None
     texcoord = faces.get("texcoord")
     if isinstance(texcoord, tuple):
         if (texcoord[1] == 2 * listed[1]).all():
-            corners.uv = texcoord[0].reshape(-1, 2)
+            polygons.uv = texcoord[0].reshape(-1, 2)
         elif texcoord[1].any():
             source.note("texture coordinates of faces that do not fit their corners")
     for element, key in ply.unseen():
@@ -657,25 +626,19 @@ def read_ply(source: MeshSource) -> list[MeshPart]:
     for element in ply.values:
         if element not in ("vertex", "face", "tristrips"):
             source.note(f"the element {element[:40]}")
-    corners.check(source, len(vertices))
-    triangles, owners = triangles_of(vertices, corners)
-    textures = ply.textures if corners.uv is not None else []
+    textures = ply.textures if polygons.uv is not None or polygons.vertex_uv is not None else []
     own = np.zeros(len(listed[1]), np.int64)
     if len(textures) > 1 and isinstance(faces.get("texnumber"), np.ndarray):
-        own = faces["texnumber"].astype(np.int64)
-    parts = []
-    for number in np.unique(own):
-        material = None
-        if textures and source.has(name := textures[max(min(number, len(textures) - 1), 0)]):
+        own = np.clip(faces["texnumber"], 0, len(textures) - 1).astype(np.int64)
+    materials = {}
+    for number in np.unique(own).tolist() if textures else ():
+        if source.has(name := textures[number]):
             source.images.append(source.picture(name, color=True))
-            material = MeshMaterial(surface=LambertMaterial((1.0, 1.0, 1.0)), base=TextureUse(len(source.images) - 1))
-        elif textures:
+            use = TextureUse(len(source.images) - 1)
+            materials[number] = MeshMaterial(surface=LambertMaterial((1.0, 1.0, 1.0)), base=use)
+        else:
             source.note(f"the texture {name[:60]}, which is not there")
-        chosen = own[owners] == number
-        cut = triangles[chosen], owners[chosen]
-        whole = bool(chosen.all())
-        parts.append(part_of(source, vertices, corners, cut, material=material, crease=None, whole=whole))
-    return [part for part in parts if part is not None]
+    return polygons.parts(own, materials, crease=None)
 
 
 READERS: Final[dict[str, Callable[[MeshSource], list[MeshPart]]]] = {
