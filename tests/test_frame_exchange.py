@@ -180,15 +180,6 @@ def test_a_borrowed_frame_is_let_go_when_it_was_read(cuda: Any) -> None:
 # ------------------------------------------------------------------------------------------------------------- results
 
 
-def test_a_result_is_handed_over_without_a_copy(pipeline: Pipeline) -> None:
-    result = pipeline(picture(), time_seconds=0.0)
-    array = wp.from_dlpack(result)
-    assert result.__dlpack_device__() == tuple(map(int, array.__dlpack_device__()))
-    np.testing.assert_array_equal(array.numpy(), result.image)
-    if isinstance(result.image_array, wp.array):
-        assert array.ptr == result.image_array.ptr
-
-
 def test_a_lit_result_is_the_device_s_own_array(device: str) -> None:
     with Synthetic("card", size=SIZE) as card:
         frame = next(iter(card)).image.copy()

@@ -71,8 +71,8 @@ def distances(light: Light) -> list[float | None]:
     return [emitter.distance for emitter in light.emitters]
 
 
-@pytest.mark.parametrize("distance", [0.35, 1.0])
-def test_a_lamp_is_found_where_it_stands(distance: float, device: str) -> None:
+def test_a_lamp_is_found_where_it_stands(device: str) -> None:
+    distance = 0.35
     frame = under_lamp(distance)
     (found,) = distances(place_emitters(lamp_light(None), SCENE, frame, POSE, device=device))
     assert found is not None

@@ -54,7 +54,7 @@ def test_frames_that_are_not_shown_keep_the_light(case, device):
 @pytest.mark.slow
 def test_in_turn_is_alone(case, device):
     """Qualities that run in turn do not touch each other."""
-    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="brute_force")}
+    qualities = {"a": PRESETS["low"], "b": dataclasses.replace(PRESETS["low"], environment_height=32)}
     times, images = measure.run_in_turn(case, qualities, device, time.perf_counter)
     for label, quality in qualities.items():
         _, alone = measure.run_in_turn(case, {label: quality}, device, time.perf_counter)
@@ -146,7 +146,7 @@ def check_choices(front, every, budgets):
             assert choice.milliseconds == pytest.approx(min(cost for cost, _ in every), abs=EXACT)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_choice_is_the_best_of_all(seed):
     method_costs = random_method_costs(seed)
     groups = [list(own) for _, own in itertools.groupby(method_costs, lambda method_cost: method_cost.setting)]

@@ -37,9 +37,7 @@ from warp_ar.kernels.recovery.recover_cells import (
 )
 from warp_ar.kernels.recovery.saturation_boundaries import weigh_boundaries
 from warp_ar.light import fit, priors
-from warp_ar.light.config import CONFIG
-from warp_ar.light.emitters import EmitterSearch, room
-from warp_ar.light.problem import Candidate, Problem, emitter_directions, mirroring_points
+from warp_ar.light.problem import mirroring_points
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.sources.deep_frame import srgb8
@@ -116,24 +114,6 @@ def test_emitters_fall_off_and_are_shadowed(device):
     assert got[0] == pytest.approx(1 / 0.335**2, rel=1e-4)
     assert got[1] == pytest.approx(0.335 / (0.335**2 + 0.4**2) ** 1.5, rel=1e-4)
     assert got[2] < 1e-4
-
-
-def test_far_emitters_are_distant_light(device):
-    """An emitter a kilometre away lights as its cell does, ball included."""
-    host = empty_scene()
-    probes = probes_of(device)
-    values, cells = cells_of(device)
-    m = 10 * CELL_COLUMNS + 20
-    direction = values["direction"].reshape(-1, 3)[m].astype(float)
-    angle = np.sqrt(values["solid_angle"].ravel()[m] / np.pi)
-    positions = [(0.0, 0.0, 0.0), (-0.1, 0.1, 0.0), (-0.17, -0.02, 0.0)]
-    points = points_of(device, positions, [(0, 0, 1)] * 3)
-    emitters = wp.array([[*(1e3 * direction), 1e3 * np.sin(angle)]], dtype=wp.vec4, device=device)
-    out = wp.zeros((3, 1), dtype=wp.float32, device=device)
-    kernels.trace_emitters(trace_of((), ()).proxies, points, seen(device, 3), emitters, probes, host.ray_scene, out)
-    straight, mirrored = transfer_of(device, points, cells, probes, host.ray_scene)
-    want = (straight + mirrored)[:, m] / values["solid_angle"].ravel()[m]
-    assert out.numpy()[:, 0] * 1e6 == pytest.approx(want, rel=1e-3)
 
 
 def look_down(device, scene, image):
@@ -317,25 +297,6 @@ def test_nonnegative_solutions_are_the_reference_ones():
         assert fit.solve_nonnegative(*sides, got) == pytest.approx(got, abs=SOLVED)
 
 
-def test_candidates_that_are_tried_at_once_cost_what_each_costs_alone(device, scene):
-    radiance, _, _ = lit_environment(((-0.5, -0.6, 0.5), 0.985, 40.0), ((0.7, -0.5, 0.5), 0.985, 5.0))
-    light = DistantLight(device, scene, noise=0.1)
-    cells, *rest = light.equations(radiance)
-    aim = emitter_directions(cells)
-    origin = mirroring_points(aim, np.array([-0.12, 0.03, 0.035]), 0.035, None)
-    problem = Problem(cells, *rest, light.surfaces, 0.85, light.trace, aim, origin)
-    search = EmitterSearch(problem, problem.card_means()[0])
-    fits = search.fit_anew()
-    cells_in = np.flatnonzero(problem.may_hold_candidate)
-    places = [Candidate(int(cell), distance) for cell in cells_in[:2] for distance in (0.6, np.inf)]
-    together = search.costs_at(places, fits)
-    assert together == pytest.approx([search.costs_at([place], fits)[0] for place in places], rel=SOLVED)
-    problem.push(places[1])
-    again = CONFIG.solver.warm_iterations
-    alone = fit.fit_channels(problem, np.insert(fits.z, problem.first_mean - 1, 0.0, axis=1), again).cost
-    assert together[1] == pytest.approx(alone.mean() - room(np.inf), rel=SOLVED)
-
-
 def test_regions_join_across_seam_and_poles():
     mask = np.zeros((16, 32), bool)
     mask[5, 0] = mask[6, 31] = True  # across the seam, diagonally
@@ -372,7 +333,7 @@ def test_shading_shares_energy_between_lights_where_the_card_cannot(device, scen
     assert 6.0 < ratios["shading"] < 16.0
 
 
-@pytest.mark.parametrize("distance", [0.3, 0.41, 0.7])
+@pytest.mark.parametrize("distance", [0.3, 0.7])
 def test_shading_finds_how_far_an_emitter_is(device, scene, distance):
     center = np.array([-0.12, 0.03, 0.035])
     direction = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
@@ -477,24 +438,3 @@ def test_all_that_is_estimated_is_finite_for_absurd_frames(device, scene):
             estimate, _ = DistantLight(device, scene).estimate(np.full((CELL_ROWS * CELL_COLUMNS, 3), value), method)
             assert np.isfinite(estimate.recovered).all()
             assert (estimate.recovered >= 0).all()
-
-
-def test_boundaries_weigh_the_same_everywhere_on_the_sphere(device):
-    height, pixels = 256, 20.0
-    d, area = reference.cell_directions(height, 2 * height)
-    shares = []
-    for toward in (
-        (0, 0, 1),
-        (0, 0, -1),
-        (1, 0, 0),
-        (-1, 0.001, 0),
-        (0.6, 0.5, 0.62),
-        (0.3, 0, 0.954),
-        (0, 0.15, -0.98),
-    ):
-        toward = np.array(toward) / np.linalg.norm(toward)
-        disc = (d @ toward > np.cos(0.12)).astype(float)
-        got = weighed_boundaries(device, disc.reshape(height, -1, 1) * np.ones(3), pixels).reshape(-1, 3)[:, 0]
-        shares.append((area @ got) / (area @ disc))
-    assert 0.2 < min(shares) < 0.8
-    assert np.ptp(shares) < 0.03

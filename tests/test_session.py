@@ -20,8 +20,6 @@ from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow
 
-SIZE = (320, 240)
-
 
 def scene(**changes: object):
     return make_scene(source=SourceSpec(synthetic="card"), **changes)

@@ -1,74 +1,83 @@
-"""Several mirror balls: objects between them are lit by what is interpolated, against a desk whose light is known."""
+"""Several mirror balls: objects between them are lit by what is interpolated between their maps."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from tests.rendered_lamp import Array, Desk
+from tests.kernel_rig import look_at
 from tests.twins import latlong
-from tests.two_balls import ALBEDO, BALLS, PLACES, TwoBalls, hits, make_scene, material, pose, rms, shares, shown_of
+from tests.twins.probe_weights import weights
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.scene import Camera, LambertMaterial, Marker, MirrorMaterial, Object, Probe, Proxy, Scene
 from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow
 
-DESK = Desk()
-WORLD = TwoBalls(DESK)
-QUALITY = PRESETS["low"].with_methods(recover="clipped")
+Array = NDArray[np.float64]
+SIZE = (320, 240)
+FOCAL = 320.0
+CAMERA = Camera(*SIZE, FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+EYE = np.array([0.0, -0.8, 0.35])
+POSE = look_at(EYE, (0.0, 0.0, 0.04))
+BALLS = tuple(Probe((x, 0.0, 0.04), 0.04, (0.85,) * 3) for x in (-0.2, 0.2))
+PLACES, RADIUS = ((-0.2, -0.05, 0.05), (-0.1, -0.05, 0.05), (0.0, -0.05, 0.05), (0.2, -0.05, 0.05)), 0.015
+"""Of the objects, beside the line from ball to ball."""
+ALBEDO = 0.8
 # Float32 through a hit (a normal is a difference of metres over 15 mm, 1e-5), a map and a sum of a few terms.
 SHADING = 1e-4
-# The same normals turn what a mirror shows by twice as much, across a lamp's edge that is one texel of 0.05 wide.
+# The same normals turn what a mirror shows by twice as much, across edges of the map's texels.
 MIRRORING = 1e-3
 
 
-def by_maps(
-    pipeline: Pipeline,
-    index: int,
-    mirror: bool = False,
-    trusts: tuple[float, ...] = (1.0, 1.0),
-    right: float = 0.0,
-) -> Array:
-    """Radiance of an object's pixels, (n, 3), by the maps that a pipeline has of its balls."""
-    _, points, normals, toward = hits(index, right)
-    arrays, name = pipeline.arrays, "environment" if mirror else "irradiance"
-    first = arrays[name if mirror else "irradiance_map"].numpy()
-    maps = [one.astype(np.float64) for one in (first, *arrays[f"others_{name}"].numpy())]
-    light = [
-        latlong.sample_latlong(one, toward) if mirror else ALBEDO / np.pi * latlong.sample_latlong(one, normals)
-        for one in maps
-    ]
-    return np.asarray(np.einsum("nb,bnc->nc", shares(BALLS, points, trusts), light))
+def make_scene(surface: Any) -> Scene:
+    """Spheres of one material between the balls."""
+    objects = tuple(Object("sphere", at=at, radius=RADIUS, material=surface) for at in PLACES)
+    return Scene(
+        CAMERA, marker=Marker(size=0.08), probes=BALLS, proxies=(Proxy("plane", size=(2.0, 2.0)),), objects=objects
+    )
+
+
+def hits(place: tuple[float, float, float]) -> tuple[NDArray[np.bool_], Array, Array, Array]:
+    """Pixels (H, W) that show an object; there its points, its normals and what they mirror, (n, 3) each."""
+    x, y = np.meshgrid(
+        (np.arange(SIZE[0]) - (SIZE[0] - 1) / 2) / FOCAL, (np.arange(SIZE[1]) - (SIZE[1] - 1) / 2) / FOCAL
+    )
+    d = np.stack([x, y, np.ones_like(x)], -1) @ POSE.rotation
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    o = EYE - place
+    along = d @ o
+    under = along**2 - o @ o + RADIUS**2
+    shown = under > 0.0
+    points = EYE + (-along - np.sqrt(np.maximum(under, 0.0)))[shown, None] * d[shown]
+    normals = (points - place) / RADIUS
+    return shown, points, normals, d[shown] - 2.0 * (d[shown] * normals).sum(-1, keepdims=True) * normals
 
 
 @pytest.mark.parametrize("mirror", [False, True])
 def test_objects_have_the_light_of_the_balls_maps_by_their_weights(device: str, mirror: bool) -> None:
-    with Pipeline(make_scene(BALLS, material(mirror)), device=device, quality=QUALITY) as pipeline:
-        pipeline(WORLD.photograph(), pose=pose(), time_seconds=0.0)
-        for index in range(len(PLACES)):
-            found, whole = shown_of(pipeline, index)
-            expected = by_maps(pipeline, index, mirror)
-            np.testing.assert_allclose(found[whole], expected[whole], rtol=MIRRORING if mirror else SHADING)
-
-
-@pytest.mark.parametrize("mirror", [False, True])
-def test_interpolated_light_is_nearer_to_the_truth_than_either_balls(device: str, mirror: bool) -> None:
-    """On objects between the balls, whose error is what interpolation cannot do: it is compared, not bounded.
-
-    A mirror shows the lamp at each ball's place, as brightly as the ball has weight: right in the mean, not where.
-    """
-    errors, true = np.zeros((3, len(PLACES))), [WORLD.truth(index, mirror) for index in range(len(PLACES))]
-    for case, probes in enumerate((BALLS[:1], BALLS[1:], BALLS)):
-        with Pipeline(make_scene(probes, material(mirror)), device=device, quality=QUALITY) as pipeline:
-            pipeline(WORLD.photograph(), pose=pose(), time_seconds=0.0)
-            shown = [shown_of(pipeline, index) for index in range(len(PLACES))]
-        for index, (light, whole) in enumerate(shown):
-            found, expected = light[whole], true[index][whole]
-            if mirror:
-                found, expected = found.mean(0), expected.mean(0)
-            errors[case, index] = rms(found - expected) / rms(expected)
-    print(np.round(errors, 3))
-    between = errors[:, 1:4]
-    assert between[2].mean() < between[:2].mean(1).min()
-    if not mirror:  # which, on its way from ball to ball, is now nearer to one's light, now to the other's
-        np.testing.assert_array_less(between[2], between[:2].min(0))
+    frame = cv2.resize(np.random.default_rng(2).integers(20, 200, (24, 32, 3)).astype(np.uint8), SIZE)
+    surface = MirrorMaterial() if mirror else LambertMaterial((ALBEDO,) * 3)
+    name, places = "environment" if mirror else "irradiance", [(*ball.center, 1.0) for ball in BALLS]
+    quality = PRESETS["low"].with_methods(recover="clipped")
+    with Pipeline(make_scene(surface), device=device, quality=quality) as pipeline:
+        pipeline(frame, pose=POSE, time_seconds=0.0)
+        virtual = pipeline.arrays["virtual"].numpy().astype(np.float64)
+        first = pipeline.arrays[name if mirror else "irradiance_map"].numpy()
+        maps = [one.astype(np.float64) for one in (first, *pipeline.arrays[f"others_{name}"].numpy())]
+    assert np.abs(maps[0] - maps[1]).max() > 0.1, "the balls must see different light"
+    # Pixels of one sample alone: the object covers them and all beside them.
+    inside = cv2.erode((virtual[..., 3] == 1.0).astype(np.uint8), np.ones((3, 3), np.uint8))
+    for place in PLACES:
+        shown, points, normals, toward = hits(place)
+        whole = inside[shown] == 1
+        assert whole.sum() > 50
+        light = [latlong.sample_latlong(one, toward if mirror else normals) for one in maps]
+        mixed = np.einsum("nb,bnc->nc", np.array([weights(places, point) for point in points]), light)
+        expected = mixed if mirror else ALBEDO / np.pi * mixed
+        found = virtual[shown][:, :3]
+        np.testing.assert_allclose(found[whole], expected[whole], rtol=MIRRORING if mirror else SHADING)

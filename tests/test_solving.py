@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import os
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,6 @@ from tests.recover_rig import solve_here
 from warp_ar import Pipeline
 from warp_ar.engine.switcher import let_go
 from warp_ar.light import solving
-from warp_ar.light.fit import one_blas_thread
 from warp_ar.light.solving import SolvingProcess
 from warp_ar.scene import load_scene
 from warp_ar.sources.sources import open_source
@@ -202,27 +200,6 @@ def test_an_estimate_that_fails_leaves_the_light_and_the_next_one_is_made(monkey
         assert "failed" not in status()
         assert np.isfinite(pipeline.arrays["environment"].numpy()).all()
     assert solvers[2] is not solvers[1]
-
-
-def test_a_fork_solves_for_itself(process):
-    """Of a process whose solver is there and whose BLAS is held: neither waits for threads that the fork lacks."""
-    with one_blas_thread():
-        child = os.fork()
-        if child == 0:
-            solver = Doubler()
-            with one_blas_thread():
-                fine = not solving.PROCESS.ready and solving.PROCESS.update(solver, sides(), trace)[0] is solver
-            os._exit(0 if fine else 1)
-    deadline = time.monotonic() + 30.0
-    done, status = os.waitpid(child, os.WNOHANG)
-    while not done and time.monotonic() < deadline:
-        time.sleep(0.05)
-        done, status = os.waitpid(child, os.WNOHANG)
-    if not done:
-        os.kill(child, 9)
-        os.waitpid(child, 0)
-    assert done, "the fork hangs"
-    assert status == 0
 
 
 def test_an_estimate_outlives_the_pipeline_that_began_it(monkeypatch):

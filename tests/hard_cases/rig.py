@@ -162,7 +162,7 @@ COMBINATIONS: dict[str, Request] = {
     **{name: _combination(name) for name in ("medium", "high", "low", "paper", "reference")},
     # Some stages run only without a change of exposure, between exposure times, or where layers are asked for.
     "composed": _combination("medium", 1.0, tuple(LAYERS), BRACKET),
-    **{f"further {number}": _combination("medium", **some) for number, some in enumerate(_further_methods())},
+    **{f"further {number}": _combination("low", **some) for number, some in enumerate(_further_methods())},
 }
 """Requests that between them hold every stage on every method, so that few pipelines are compiled."""
 SLOW = ("reference", "further 0")
