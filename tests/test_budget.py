@@ -16,7 +16,6 @@ from warp_ar.accuracy.budget import AutoPipeline
 from warp_ar.accuracy.controller import AIM, LEAST, MEMORY, Controller
 from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings
 from warp_ar.accuracy.costs import Costs
-from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.stages.quality import PRESETS
 
@@ -173,7 +172,7 @@ def test_load_is_answered_and_taken_back_when_it_goes():
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("budget", [12.0, 33.0, 60.0, 400.0])
+@pytest.mark.parametrize("budget", [12.0, 60.0])
 def test_ten_thousand_noisy_frames_bring_no_flicker(budget, seed):
     """Frames whose times scatter by a fifth, every fiftieth five times too long; costs that are a fifth off."""
     off = np.random.default_rng(100 + seed)
@@ -280,33 +279,6 @@ def test_no_flicker_where_the_better_method_does_not_quite_fit():
     assert tried >= 2, "it must have tried"
     cheat(MEMORY)
     assert machine.changes() - tried <= 4
-
-
-def test_what_cannot_be_built_is_told_and_never_shown(frames: Frames, tmp_path, monkeypatch, capsys) -> None:
-    """A device without room for what the budget would allow: the run goes on by other methods."""
-    scene = make_scene()
-    settings = relevant_settings(scene, (320, 240))
-    warm_up = Pipeline.warm_up
-
-    def no_room(pipeline, progress=None):
-        if pipeline.quality.environment_height > 64:
-            raise RuntimeError("Failed to allocate 12 bytes on device 'cuda:0'")
-        warm_up(pipeline, progress)
-
-    monkeypatch.setattr(Pipeline, "warm_up", no_room)
-    costs = even_costs(settings, base=20.0, step=0.1, most=0.1, free=(*HEIGHT, "irradiance"))
-    with AutoPipeline(scene, device="cpu", budget_ms=1e4, costs=costs, folder=tmp_path) as pipeline:
-        assert pipeline.status() == {"budget_ms": 1e4, "changes": []}
-        pipeline(frames[0])
-        assert pipeline.status()["changes"] == [], "one frame tells no load"
-        for _ in range(20):
-            light(pipeline, frames[0])
-        status = pipeline.status()
-        assert pipeline.quality.environment_height <= 64
-    assert int(status["rejected"][0]["settings"]["environment_height"]) > 64, "it must have been tempted"
-    assert status["changes"]
-    assert int(status["settings"]["environment_height"]) <= 64
-    assert capsys.readouterr().err.count("Failed to allocate 12 bytes") == len(status["rejected"])
 
 
 def test_says_once_that_nothing_fits(frames: Frames, tmp_path, capsys) -> None:

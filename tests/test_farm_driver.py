@@ -84,13 +84,6 @@ def test_every_job_is_given_once_and_joined_last(jobs, tmp_path):
     assert pool.most == 3, "all workers must have been busy at once"
 
 
-def test_a_finished_run_has_nothing_left(jobs, tmp_path):
-    drive(jobs, tmp_path / "run")
-    pool, failed, _ = drive(jobs, tmp_path / "run")
-    assert pool.given == []
-    assert not failed
-
-
 def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path):
     def behave(job, before):
         return Outcome("failed", reason="frame 3 cannot be decoded") if job == Job("segment", 1, 2, 4, 6) else None

@@ -65,9 +65,8 @@ def lit_whole(jobs, run):
         return lit(lighter, 0, COUNT)
 
 
-@pytest.mark.parametrize("light", ["follow", "fixed"])
-def test_segments_are_bit_equal_to_one_run_where_light_is_given(folder, light):
-    jobs, run = surveyed(folder, light=light)
+def test_segments_are_bit_equal_to_one_run_where_light_is_fixed(folder):
+    jobs, run = surveyed(folder, light="fixed")
     whole = lit_whole(jobs, run)
     with Lighter(jobs, run, "cpu") as lighter:
         parts = {first: lit(lighter, first, first + 2) for first in (4, 0, 2)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import subprocess
@@ -10,15 +9,13 @@ import sys
 
 import pytest
 
-from warp_ar.errors import UsageError, causes
+from warp_ar.errors import UsageError
 from warp_ar.farm import manifest as manifests
 from warp_ar.farm.manifest import (
-    NO_SPACE,
     Manifest,
     RunError,
     aside,
     begin_run,
-    clear_aside,
     load_run,
     locked,
     publish,
@@ -117,39 +114,6 @@ def test_outputs_appear_whole_with_their_record(tmp_path):
     assert not list((tmp_path / ".aside").iterdir())
 
 
-def test_outputs_that_are_there_are_not_replaced(tmp_path):
-    for content in (b"first", b"again"):
-        with aside(tmp_path, "one") as part:
-            (part / "x").write_bytes(content)
-            publish(part, tmp_path / "one", "key")
-    assert (tmp_path / "one/x").read_bytes() == b"first"
-
-
-def test_something_else_in_the_place_is_an_error(tmp_path):
-    (tmp_path / "one").mkdir()
-    (tmp_path / "one/foreign").write_bytes(b"")
-    with aside(tmp_path, "one") as part:
-        (part / "x").write_bytes(b"")
-        with pytest.raises(OSError, match="not empty"):
-            publish(part, tmp_path / "one", "key")
-
-
-def test_a_digest_is_of_names_and_contents(tmp_path):
-    digests = set()
-    for number, (name, content) in enumerate([("x", b"1"), ("y", b"1"), ("x", b"2"), ("x", b"1")]):
-        with aside(tmp_path, str(number)) as part:
-            (part / name).write_bytes(content)
-            digests.add(publish(part, tmp_path / f"place-{number}", "key")["sha256"])
-    assert len(digests) == 3
-
-
-def test_what_a_dead_worker_left_is_cleared(tmp_path):
-    (tmp_path / ".aside/dead").mkdir(parents=True)
-    (tmp_path / ".aside/dead/x").write_bytes(b"")
-    clear_aside(tmp_path)
-    assert not (tmp_path / ".aside").exists()
-
-
 def test_one_driver_at_a_time(tmp_path):
     code = (
         "import pathlib, sys\nfrom warp_ar.farm.manifest import locked\n"
@@ -181,15 +145,3 @@ def test_a_run_begins_in_a_folder_of_its_own(tmp_path):
         begin_run(tmp_path / "other", {}, "version")
     with pytest.raises(UsageError, match="holds no run"):
         load_run(tmp_path / "other")
-
-
-def test_a_full_disk_is_known_behind_other_errors():
-    def fails():
-        try:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        except OSError as error:
-            raise ValueError("cannot be written") from error
-
-    with pytest.raises(ValueError, match="cannot be written") as caught:
-        fails()
-    assert any(getattr(cause, "errno", None) in NO_SPACE for cause in causes(caught.value))

@@ -90,13 +90,6 @@ def test_a_recording_without_sound_or_none_at_all(tmp_path):
             assert not container.streams.audio
 
 
-def test_odd_sizes_are_padded_as_in_other_videos(tmp_path):
-    with open_part_sink(tmp_path / "odd.mp4", TICK, 24.0, "8bit", "srgb") as sink:
-        for number, image in enumerate(desk_frames(2)):
-            sink.write_at(image[:101, :133], number / 24.0)
-    assert decoded(tmp_path / "odd.mp4")[0].shape == (102, 134, 3)
-
-
 def test_a_part_of_another_time_base_is_refused(tmp_path):
     parts, starts = write_parts(tmp_path, [0, 25, 50, 75], [0, 4])
     with pytest.raises(SourceError, match="is none of its recording"):

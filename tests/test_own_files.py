@@ -22,7 +22,7 @@ from warp_ar.output.places import claim_places
 from warp_ar.output.sinks import open_sink
 from warp_ar.output.video_sink import VideoSink, WholeFragments
 from warp_ar.scene import Camera
-from warp_ar.signature import COMMENT, PROGRAM, is_signed, sign_png
+from warp_ar.signature import COMMENT, PROGRAM, is_signed
 from warp_ar.tracking.card_layout import CARD_MARKER
 
 
@@ -203,12 +203,3 @@ def test_others_are_not(tmp_path: pathlib.Path) -> None:
         assert not is_signed(tmp_path / str(number))
     assert not is_signed(tmp_path)
     assert not is_signed(tmp_path / "nothing")
-
-
-def test_a_signed_png_is_the_same_picture() -> None:
-    import cv2
-
-    image = np.random.default_rng(0).integers(0, 256, (9, 7, 3), np.uint8)
-    ok, data = cv2.imencode(".png", image)
-    assert ok
-    assert np.array_equal(cv2.imdecode(np.frombuffer(sign_png(data.tobytes()), np.uint8), cv2.IMREAD_COLOR), image)

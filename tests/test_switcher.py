@@ -16,7 +16,6 @@ from warp_ar.engine import switcher as module
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.switcher import PipelineSwitcher, Target, let_go
 from warp_ar.errors import UsageError
-from warp_ar.scene import Light
 from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow
@@ -41,35 +40,6 @@ def go_over(switcher: PipelineSwitcher, wanted: Target) -> Pipeline | None:
     switcher.take()
     settle(switcher)  # what was built before could not take over
     return switcher.take()
-
-
-def test_numbers_are_changed_in_place_and_all_else_is_built_in_the_background() -> None:
-    switcher = PipelineSwitcher(device="cpu")
-    first = switcher.open(target())
-    assert switcher.follow(target(lights=(Light("point", 5.0, at=(0.1, -0.1, 0.2)),))) is first
-    assert not switcher.busy
-    switcher.follow(target(PAPER))
-    assert switcher.pipeline is first, "frames go on with the one before"
-    settle(switcher)
-    second = switcher.take()
-    assert second is not first
-    assert second is not None
-    assert second.quality == PAPER
-    assert switcher.swaps == 2
-    switcher.close()
-
-
-def test_the_light_and_the_clock_go_along(frames: Frames) -> None:
-    switcher = PipelineSwitcher(device="cpu")
-    before = switcher.open(target())
-    before(frames[0], time_seconds=0.0)
-    light = before.arrays["environment_radiance"].numpy().copy()
-    after = go_over(switcher, target(PAPER))
-    assert after is not None
-    assert after is not before
-    np.testing.assert_array_equal(after.arrays["environment_radiance"].numpy(), light)
-    assert after(frames[0], time_seconds=0.1).pose is not None
-    switcher.close()
 
 
 def test_what_is_wanted_while_something_is_built_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
