@@ -137,9 +137,6 @@ def test_limits_are_said(files, wanted, monkeypatch):
     monkeypatch.setattr(uploads, "MOST_TRIANGLES", 11)
     with pytest.raises(UsageError, match="12 triangles; at most 11"):
         files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
-    monkeypatch.setattr(uploads, "MOST_BYTES", 50)
-    with pytest.raises(UsageError, match="MB; at most"):
-        files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
     monkeypatch.undo()
     monkeypatch.setattr(uploads, "MOST_FILES", 1)
     files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
@@ -313,9 +310,9 @@ def corrupt():
     [
         (corrupt(), "no ZIP that can be unpacked"),
         (raw_zip("a.bin", "a.bin__b.bin"), "no ZIP that can be unpacked"),
-        (raw_zip("n" * 300 + ".bin"), "304 characters"),
-        (raw_zip("__".join(["folder"] * 700) + ".bin"), "4903 characters"),
-        (raw_zip("__".join(["d"] * 2000) + ".bin"), "4003 characters"),
+        (raw_zip("n" * 300 + ".bin"), "is no file that a scene may name"),
+        (raw_zip("__".join(["folder"] * 700) + ".bin"), "is no file that a scene may name"),
+        (raw_zip("__".join(["d"] * 2000) + ".bin"), "is no file that a scene may name"),
     ],
     ids=["deflate", "both", "name", "path", "levels"],
 )

@@ -122,15 +122,11 @@ _SCALES: Final = (0.5, 1.5)
 """Smallest and largest accepted ratio of a ruler's measured to nominal length; beyond, it was misread."""
 
 _LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "probe": "probes"}
-# Keys that the page may set. None of them names a file.
-_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
-    "object": ("at", "rotate", "scale", "radius", "size", "major_radius", "minor_radius"),
-    "light": ("at", "target", "direction", "color", "intensity", "inner_angle", "outer_angle", "radius"),
-    "proxy": ("at", "rotate", "size"),
-    "exposure": ("scale",),
-    "marker": ("dictionary", "id", "size"),
-    "material": ("base_color", "diffuse", "specular", "shininess", "metallic", "roughness", "color", "intensity"),
+_KEYS: Final = {
+    *("at", "rotate", "scale", "radius", "size", "major_radius", "minor_radius", "target", "direction", "color"),
+    *("intensity", "inner_angle", "outer_angle", "dictionary", "id"),
 }
+"""Keys that the page may set, besides those of materials. None of them names a file."""
 NEW: Final[Mapping[tuple[str, str], Object | Light]] = {
     ("object", "sphere"): Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
     ("object", "box"): Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
@@ -232,10 +228,10 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
     """
     items = _items(scene, part, index) if part in _LISTS else []
     item = items[index] if items else getattr(scene, part)
-    if isinstance(item, Object) and (key == "model" or key in _KEYS["material"]):
+    if isinstance(item, Object) and not hasattr(item, key):
         changes: dict[str, Any] = {"material": _material(_shown_material(item), key, value)}
-    elif key not in _KEYS[part]:
-        raise UsageError(f"{part}: key {key!r} cannot be edited; expected {', '.join(_KEYS[part])}")
+    elif key not in _KEYS or not hasattr(item, key):
+        raise UsageError(f"{part}: key {key!r} cannot be edited")
     else:
         changes = {key: value}
         if key in ("target", "direction"):

@@ -26,10 +26,8 @@ from warp_ar.errors import WarpArError, reason
 from warp_ar.pictures import picture_size
 from warp_ar.stages.quality import PRESETS
 
-MAX_TEXT: Final = 4096
-"""Longest text message from a page in bytes: an edit takes under 200."""
-MAX_PICTURE: Final = 1 << 20
-"""Largest binary message from a page in bytes: a JPEG of 1920x1080 at quality 0.85 takes half of it."""
+MAX_MESSAGE: Final = (1 << 20) + 64
+"""Largest message from a page in bytes: a JPEG of 1920x1080 at quality 0.85 takes half of it."""
 MOST_BYTES: Final = 1 << 26
 """Largest dropped file, bytes: 64 MB."""
 SMALLEST_CAMERA: Final = (64, 48)
@@ -194,8 +192,6 @@ def parse_text(text: str) -> Command:
     Raises:
         ProtocolError: The message is not a valid command.
     """
-    if len(text) > MAX_TEXT:
-        raise ProtocolError(f"text message of {len(text)} characters; {MAX_TEXT} at most")
     try:
         message = json.loads(text)  # NaN and infinities are in no range of the checks
     except (ValueError, RecursionError) as error:
@@ -224,8 +220,6 @@ def parse_picture(data: bytes, size: tuple[int, int]) -> Picture:
     Raises:
         ProtocolError: The message is not such a picture.
     """
-    if len(data) > MAX_PICTURE:
-        raise ProtocolError(f"picture of {len(data)} bytes; {MAX_PICTURE} at most")
     if len(data) <= _PICTURE_HEADER.size:
         raise ProtocolError("binary message holds no picture")
     taken, number = _PICTURE_HEADER.unpack_from(data)

@@ -361,7 +361,7 @@ class Server:
         if len(self._viewers) >= MOST_VIEWERS:
             return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n")
         host = await self.started()
-        viewer = _Viewer(await self.websocket(request, protocol.MAX_PICTURE + 64))
+        viewer = _Viewer(await self.websocket(request, protocol.MAX_MESSAGE))
         self._viewers.add(viewer)  # from here on messages wait in its queue, to be sent after the greetings
         host.watch(1)
         sender: asyncio.Task[None] | None = None

@@ -16,7 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path, PurePosixPath
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 
@@ -39,7 +39,6 @@ _KINDS: Final = {*MESH_SUFFIXES, ".mtl", ".bin", ".exr", ".hdr", ".txt", ".json"
 """Endings of files that a scene may name."""
 LONGEST_NAME: Final = 200
 """Largest number of characters of a ZIP member's path."""
-_T = TypeVar("_T")
 
 
 def pack_scene(scene: Scene) -> bytes:
@@ -108,20 +107,20 @@ def _check_members(name: str, members: list[zipfile.ZipInfo], most: int) -> None
     if (size := sum(member.file_size for member in members)) > most:
         raise UsageError(f"{name} unpacks to {_megabytes(size)}; at most {_megabytes(most)} are taken")
     for inside in names:
-        parts = PurePosixPath(inside)
-        if len(inside) > LONGEST_NAME:
-            limit = f"at most {LONGEST_NAME} are taken"
-            raise UsageError(f"{name}: {_shown(inside)} ... has {len(inside)} characters; {limit}")
-        plain = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", inside) and ".." not in parts.parts
-        if not plain or (inside != SCENE and parts.suffix.lower() not in _KINDS):
+        if not _is_plain(inside) or (inside != SCENE and PurePosixPath(inside).suffix.lower() not in _KINDS):
             raise UsageError(f"{name}: {_shown(inside)} is no file that a scene may name")
 
 
 def _packed_path(name: str) -> str:
     """Return the relative path at which a mesh's own file is packed: as the mesh names it, if that is safe."""
     plain = name.strip().replace("\\", "/")
-    inside = re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", plain) and ".." not in PurePosixPath(plain).parts
-    return plain if inside else plain.rsplit("/", 1)[-1]
+    return plain if _is_plain(plain) else plain.rsplit("/", 1)[-1]
+
+
+def _is_plain(path: str) -> bool:
+    """Return True for a relative path of at most LONGEST_NAME plain characters that leads into no folder above."""
+    plain = len(path) <= LONGEST_NAME and re.fullmatch(r"[\w .()-]+(/[\w .()-]+)*", path)
+    return bool(plain) and ".." not in PurePosixPath(path).parts
 
 
 def _plain(stem: str) -> str:
@@ -159,7 +158,7 @@ class DroppedFiles:
 
         Args:
             name: Name of the file.
-            data: Content of the file.
+            data: Content of the file, which the server has limited to ``MOST_BYTES``.
             wanted: Shown state.
 
         Raises:
@@ -169,8 +168,6 @@ class DroppedFiles:
         suffix = Path(name).suffix.lower()
         if suffix not in SUFFIXES:
             raise UsageError(f"{_shown(name)}: expected a file that ends in {', '.join(SUFFIXES)}")
-        if len(data) > MOST_BYTES:
-            raise UsageError(f"{_shown(name)} has {_megabytes(len(data))}; at most {_megabytes(MOST_BYTES)} are taken")
         if suffix == ".toml":
             return self._scene_edit(_shown(name), data, wanted)
         if self._count >= MOST_FILES:
@@ -245,8 +242,9 @@ def _mesh_edit(name: str, path: Path, wanted: Wanted) -> Edit:
     # Files are usually in metres, or in millimetres if meant for 3D printers; otherwise units are unknown.
     scale = next((unit for unit in (1.0, 0.001) if SIZES[0] <= longest * unit <= SIZES[1]), USUAL / longest)
     middle = (low + high) / 2
-    at = (PLACE[0] - scale * middle[0], PLACE[1] - scale * middle[1], -scale * low[2])
-    item = Object("mesh", file=path, at=_rounded(at), scale=float(f"{scale:.6g}"))
+    at = PLACE[0] - scale * middle[0], PLACE[1] - scale * middle[1], -scale * low[2]
+    x, y, z = (round(float(value), 5) for value in at)
+    item = Object("mesh", file=path, at=(x, y, z), scale=float(f"{scale:.6g}"))
     add_item(wanted.scene, "object", item)  # raises its errors now, before the file is accepted
     sides = " x ".join(f"{1e3 * scale * side:.0f}" for side in high - low)
     units = {1.0: "metres", 0.001: "millimetres"}.get(scale, "units of its own, so its longest side is 120 mm")
@@ -254,11 +252,6 @@ def _mesh_edit(name: str, path: Path, wanted: Wanted) -> Edit:
     if mesh.notes:
         words += f" Not shown: {'; '.join(mesh.notes[:4])}."
     return lambda w: dataclasses.replace(w, scene=add_item(w.scene, "object", item)), f"drop {name}", words
-
-
-def _rounded(values: Iterable[float]) -> tuple[float, float, float]:
-    x, y, z = (round(float(value), 5) for value in values)
-    return x, y, z
 
 
 def _light_edit(name: str, path: Path) -> Edit:
