@@ -5,6 +5,7 @@ fall on the real desk. ``Session`` opens a scene and lights its frames; ``Pipeli
 provides; ``warp_ar.kernels`` has the launchers of single steps. Importing this package does not initialise Warp.
 """
 
+# ruff: noqa: I001
 from __future__ import annotations
 
 import importlib
@@ -13,20 +14,37 @@ TYPE_CHECKING = False  # importing typing for it takes time, during which no com
 if TYPE_CHECKING:
     from typing import Any
 
-    from warp_ar.engine.graph import Plan, make_plan
-    from warp_ar.engine.pipeline import Pipeline, Result
-    from warp_ar.engine.switcher import PipelineSwitcher
-    from warp_ar.errors import SceneError, SinkError, SourceError, UpdateError, UsageError, WarpArError
-    from warp_ar.light.captured import Light
-    from warp_ar.output.environment_file import read_environment, write_environment
-    from warp_ar.output.sinks import open_sink
-    from warp_ar.photo_capture import Capture, capture_light
-    from warp_ar.scene import Pose, Scene, bundled_scenes, dumps_scene, load_scene
-    from warp_ar.session import Session
-    from warp_ar.sources.sources import Frame, open_source
-    from warp_ar.stages.quality import PRESETS, Quality
-    from warp_ar.stages.request import LAYERS
-    from warp_ar.tracking.tracking import Tracker, TrackState
+    # "as" tells type checkers that a name is public; isort would give each a statement of its own.
+    from warp_ar.engine.graph import Plan as Plan, make_plan as make_plan
+    from warp_ar.engine.pipeline import Pipeline as Pipeline, Result as Result
+    from warp_ar.engine.switcher import PipelineSwitcher as PipelineSwitcher
+    from warp_ar.errors import (
+        SceneError as SceneError,
+        SinkError as SinkError,
+        SourceError as SourceError,
+        UpdateError as UpdateError,
+        UsageError as UsageError,
+        WarpArError as WarpArError,
+    )
+    from warp_ar.light.captured import Light as Light
+    from warp_ar.output.environment_file import (
+        read_environment as read_environment,
+        write_environment as write_environment,
+    )
+    from warp_ar.output.sinks import open_sink as open_sink
+    from warp_ar.photo_capture import Capture as Capture, capture_light as capture_light
+    from warp_ar.scene import (
+        Pose as Pose,
+        Scene as Scene,
+        bundled_scenes as bundled_scenes,
+        dumps_scene as dumps_scene,
+        load_scene as load_scene,
+    )
+    from warp_ar.session import Session as Session
+    from warp_ar.sources.sources import Frame as Frame, open_source as open_source
+    from warp_ar.stages.quality import PRESETS as PRESETS, Quality as Quality
+    from warp_ar.stages.request import LAYERS as LAYERS
+    from warp_ar.tracking.tracking import Tracker as Tracker, TrackState as TrackState
 
 _HOMES = {
     "errors": ("SceneError", "SinkError", "SourceError", "UpdateError", "UsageError", "WarpArError"),
@@ -48,38 +66,7 @@ _RENAMED: dict[str, str] = {}
 """Former public names, which work with a warning for one minor version, and their present names."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
-__all__ = [
-    "LAYERS",
-    "PRESETS",
-    "Capture",
-    "Frame",
-    "Light",
-    "Pipeline",
-    "PipelineSwitcher",
-    "Plan",
-    "Pose",
-    "Quality",
-    "Result",
-    "Scene",
-    "SceneError",
-    "Session",
-    "SinkError",
-    "SourceError",
-    "TrackState",
-    "Tracker",
-    "UpdateError",
-    "UsageError",
-    "WarpArError",
-    "bundled_scenes",
-    "capture_light",
-    "dumps_scene",
-    "load_scene",
-    "make_plan",
-    "open_sink",
-    "open_source",
-    "read_environment",
-    "write_environment",
-]
+__all__ = sorted(_HOME_OF)
 
 
 class _Help:
