@@ -73,15 +73,6 @@ def _scene_in(folder: Path) -> Path:
     return found[0]
 
 
-def _scenes_in_folder(path: Path) -> list[str]:
-    """Return the folders with a scene next to a missing path, for suggestions in messages."""
-    try:
-        folders = sorted(folder for folder in path.parent.iterdir() if is_folder(folder))[:200]
-        return [str(folder) for folder in folders if any(folder.glob("[!.]*.toml"))]
-    except (OSError, ValueError):
-        return []
-
-
 @checked
 def load_scene(path_or_name: str | os.PathLike[str], files: SceneFiles | None = None) -> Scene:
     """Read a scene file.
@@ -99,9 +90,8 @@ def load_scene(path_or_name: str | os.PathLike[str], files: SceneFiles | None = 
         path = _scene_in(path)
     if not is_file(path):
         if str(path_or_name) not in bundled:
-            known = [*_scenes_in_folder(path), *bundled]
-            hint = f"a file, or a bundled scene ({nearest(str(path_or_name), known)})" if known else "a scene file"
-            raise SceneError(f"{path}: no such scene; expected {hint}")
+            hint = nearest(str(path_or_name), bundled)
+            raise SceneError(f"{path}: no such scene; expected a file, or a bundled scene ({hint})")
         path = bundled[str(path_or_name)]
     if path.suffix.lower() in FRAMES:
         raise SceneError(f"{path} is no scene; expected a scene file{FRAMES_GO}")
