@@ -19,10 +19,11 @@ from tests.test_live import message, write_scene
 from warp_ar import export
 from warp_ar.output.environment_file import read_environment
 from warp_ar.output.gltf_file import write_glb
-from warp_ar.output.shot import Shot, mesh_of, placement, texture_files, used_materials
+from warp_ar.output.shot import Shot, mesh_of, texture_files, used_materials
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
 from warp_ar.scene.description import Animation
+from warp_ar.scene.geometry import placement
 from warp_ar.scene.materials import EmissiveMaterial, PhongMaterial
 from warp_ar.scene.mesh_files import load_mesh
 

@@ -204,7 +204,7 @@ def test_obj_finds_its_texture_or_says_which_is_missing(tmp_path: pathlib.Path) 
     path = tmp_path / "a.obj"
     path.write_text(OBJ)
     mesh = load_mesh(path)  # coordinates but no material: nothing is made up
-    assert mesh.texture is None
+    assert not mesh.images
     assert mesh.uvs is not None
     (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd wood.png\n")
     with pytest.raises(SceneError, match=r"/wood\.png, which it names, is not there"):
@@ -213,7 +213,7 @@ def test_obj_finds_its_texture_or_says_which_is_missing(tmp_path: pathlib.Path) 
     with pytest.raises(SceneError, match=r"wood\.png, which it names, cannot be decoded"):
         load_mesh(path)
     Image.new("RGB", (2, 3), (1, 2, 3)).save(tmp_path / "wood.png")
-    np.testing.assert_array_equal(load_mesh(path).texture, np.full((3, 2, 3), (1, 2, 3)))
+    np.testing.assert_array_equal(load_mesh(path).images[0], np.full((3, 2, 4), (1, 2, 3, 255)))
     (tmp_path / "wood.png").write_bytes((tmp_path / "wood.png").read_bytes()[:45])
     with pytest.raises(SceneError):
         load_mesh(path)

@@ -258,5 +258,5 @@ def test_many_copies_of_a_mesh_are_counted(tmp_path: pathlib.Path, monkeypatch: 
     path = made.save(tmp_path / "a.glb")
     assert len(load_mesh(path).faces) == 1200
     monkeypatch.setenv("WARP_AR_MAX_MESH_ELEMENTS", "1000")
-    with pytest.raises(SceneError, match=r"1,00\d faces; at most 1,000"):
+    with pytest.raises(SceneError, match=r"1,00\d vertices or faces; at most 1,000"):
         load_mesh(path)

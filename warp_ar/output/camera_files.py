@@ -18,7 +18,6 @@ import uuid
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import OpenEXR
@@ -27,7 +26,7 @@ from warp_ar.exr_file import exr_header, store_exr
 from warp_ar.files import store
 from warp_ar.output.shot import FILM_WIDTH, Matrix, Shot
 from warp_ar.scene import Camera
-from warp_ar.scene.pixel_rays import pixel_rays
+from warp_ar.scene.pixel_rays import pixel_rays, project
 
 TRACK_SUFFIX = ".jsonl"
 
@@ -109,9 +108,7 @@ def undistort_map(camera: Camera) -> npt.NDArray[np.float32]:
     """Return s and t, (height, width, 2): the place in the frame of each pixel of an undistorted picture."""
     columns, rows = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
     x, y = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
-    points = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-    none = np.zeros(3)
-    found, _ = cv2.projectPoints(points, none, none, camera.matrix(), np.array(camera.distortion))
+    found = project(camera, np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3))
     return _coordinates(camera, found.reshape(camera.height, camera.width, 2))
 
 

@@ -38,6 +38,7 @@ from warp_ar.files import store
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, FolderSink
 from warp_ar.scene import Scene
+from warp_ar.scene.geometry import placement
 from warp_ar.scene.messages import nearest
 from warp_ar.scene.object_shapes import surface_names
 from warp_ar.signals import REC_709
@@ -326,16 +327,13 @@ class SideFiles(Closing):
 def layer_frame(frame: npt.NDArray[np.uint8], result: Result, scene: Scene) -> LayerFrame:
     """Return a result's layers for a file; arguments are those of `SideFiles.write`."""
     camera = scene.camera.scaled_to(frame.shape[1], frame.shape[0])
-    from_world: Any = None
-    if result.pose is not None:
-        from_world = np.eye(4)
-        from_world[:3, :3], from_world[:3, 3] = result.pose.rotation, result.pose.translation
+    pose = result.pose
     return LayerFrame(
         result.layers,
         frame,
         surface_names(scene),
         result.exposure_scale,
         str(camera.transfer),
-        from_world,
+        None if pose is None else placement(pose.rotation, pose.translation),
         camera.matrix(),
     )

@@ -16,14 +16,13 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.description import Light, Object, Proxy
-from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.geometry import Mesh, placement, rotation_matrix
 from warp_ar.scene.materials import (
     RGB,
     Color,
@@ -260,13 +259,6 @@ class Shot:
         """
         times = self.seconds if light.animate is not None else (0.0,)
         return tuple(placement(_turn_to(direction), at) for at, direction in map(light.pose_at, times))
-
-
-def placement(linear: Any, translation: Any) -> Matrix:
-    """Return the (4, 4) matrix, for column vectors, that maps x to linear x + translation."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = linear, translation
-    return matrix
 
 
 def _turn_to(direction: Matrix) -> Matrix:

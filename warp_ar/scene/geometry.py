@@ -60,14 +60,6 @@ class Mesh:
     """Names of contents of the file that are not shown."""
 
     @property
-    def texture(self) -> ByteArray | None:
-        """Return the base colour picture of the first material that has one, (h, w, 3) RGB, sRGB-encoded."""
-        for material in self.materials:
-            if material.base is not None:
-                return self.images[material.base.image][..., :3]
-        return None
-
-    @property
     def bounds(self) -> FloatArray:
         """Return the lowest and highest corner of the vertices' axis-aligned bounding box in metres, (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
@@ -102,6 +94,13 @@ def quaternion_matrix(quaternion: npt.NDArray[np.float64]) -> npt.NDArray[np.flo
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def placement(linear: Any, translation: Any) -> npt.NDArray[np.float64]:
+    """Return the (4, 4) matrix, for column vectors, that maps x to linear x + translation."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, translation
+    return matrix
 
 
 def make_mesh(vertices: Any, faces: Any, normals: Any, uvs: Any = None, **others: Any) -> Mesh:

@@ -463,8 +463,7 @@ class _Reader:
             if part is None:
                 continue
             self._elements += len(part.faces)
-            if self._elements > limits().mesh_elements:
-                raise SceneError(too_much(f"{self._source.path}", self._elements, "faces", "mesh_elements"))
+            self._source.check_count(self._elements)
             bones, moves = self._bones(node, primitive) if "skin" in node else (None, False)
             morph = None if weights is None else self._morph(primitive, part, weights)
             bend = functools.partial(_bend, part, morph, bones, transform)
@@ -496,8 +495,7 @@ class _Reader:
         if colors is not None and self._memory:
             colors = linear_rgba(colors, 1.0)
         faces = self._faces(primitive, count)
-        if len(faces) > limits().mesh_elements:
-            raise SceneError(too_much(f"{self._source.path}", len(faces), "faces", "mesh_elements"))
+        self._source.check_count(len(faces))
         if not len(faces):
             return None
         number = primitive.get("material")

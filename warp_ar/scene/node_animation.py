@@ -25,7 +25,7 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.scene.geometry import Mesh, quaternion_matrix
+from warp_ar.scene.geometry import Mesh, placement, quaternion_matrix
 
 Array = npt.NDArray[np.float64]
 Bend: TypeAlias = Callable[[float], Mesh]
@@ -109,10 +109,8 @@ class NodeTrack:
         def now(name: str, still: Array) -> Array:
             return self.samplers[name].at(seconds) if name in self.samplers else still
 
-        result = np.eye(4)
-        result[:3, :3] = quaternion_matrix(now("rotation", self.rotation)) * now("scale", self.scale)
-        result[:3, 3] = now("translation", self.translation)
-        return result
+        linear = quaternion_matrix(now("rotation", self.rotation)) * now("scale", self.scale)
+        return placement(linear, now("translation", self.translation))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

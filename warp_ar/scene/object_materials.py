@@ -18,7 +18,7 @@ import numpy as np
 from warp_ar.declared import checked
 from warp_ar.errors import SceneError, printable
 from warp_ar.scene.description import FLATTEST, Object, Scene
-from warp_ar.scene.geometry import Mesh, make_mesh
+from warp_ar.scene.geometry import Mesh, make_mesh, placement
 from warp_ar.scene.materials import (
     Color,
     EmissiveMaterial,
@@ -128,10 +128,8 @@ def mesh_of(item: Object) -> Mesh | None:
 @functools.lru_cache(maxsize=16)
 def stretched_mesh(mesh: Mesh, stretch: tuple[float, ...]) -> Mesh:
     """Return a mesh whose points are mapped by an invertible matrix, given by rows; cached."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.reshape(stretch, (3, 3))
     own = {name: getattr(mesh, name) for name in ("vertices", "faces", "normals", "tangents")}
-    moved = MeshPart(**own).moved(matrix)
+    moved = MeshPart(**own).moved(placement(np.reshape(stretch, (3, 3)), 0.0))
     return make_mesh(**{**vars(mesh), **{name: getattr(moved, name) for name in own}})
 
 

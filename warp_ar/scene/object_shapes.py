@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.scene.description import FLATTEST, Object, Scene
-from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.geometry import Mesh, placement
 from warp_ar.scene.mesh_parts import LARGEST
 from warp_ar.scene.node_animation import Bend, MovingMesh
 from warp_ar.scene.object_materials import moving_mesh_of
@@ -71,8 +71,7 @@ def part_placements(item: Object, moving: MovingMesh, seconds: float) -> Array:
     """
     assert item.play is not None
     rotation, position = item.pose_at(seconds)
-    own = np.eye(4)
-    own[:3, :3], own[:3, 3] = item.scale * rotation @ item.stretch_matrix(), position
+    own = placement(item.scale * rotation @ item.stretch_matrix(), position)
     with np.errstate(over="ignore", invalid="ignore"):  # products of large scales overflow; see split_linear
         placed: Array = own @ moving.transforms_at(item.play.time_at(seconds, moving.duration))
     return placed

@@ -375,13 +375,13 @@ class HostScene:
         placed = self._objects.tobytes()
         if placed != self._placed:
             self._placed = placed
-            self._outline = Outline([face for record in _present(self._objects) for face in box_faces(record)])
+            self._outline = _outline_of(self._objects)
         return self._outline
 
     def _receiver_outline(self) -> Outline:
         """Return the outline of all proxies."""
         if self._receivers is None:
-            self._receivers = Outline([face for record in _present(self._proxies) for face in box_faces(record)])
+            self._receivers = _outline_of(self._proxies)
         return self._receivers
 
     def light_outline(self, *, bounced: bool = False) -> Outline:
@@ -402,13 +402,18 @@ class HostScene:
         if not receivers:
             return self._balls
         if self._mirrors is None or self._mirrors[0] is not self._balls:
-            faces = [face for record in _present(self._proxies[self._glossy]) for face in box_faces(record)]
+            faces = _outline_of(self._proxies[self._glossy]).polygons
             self._mirrors = self._balls, Outline([*self._balls.polygons, *faces])
         return self._mirrors[1]
 
     def shadow_outline(self) -> Outline:
         """Return the outline within which virtual objects can change the environment's light on proxies."""
         return self._receiver_outline() if self.object_outline().polygons else NOTHING
+
+
+def _outline_of(records: npt.NDArray[Any]) -> Outline:
+    """Return the outline of shapes by their records."""
+    return Outline([face for record in _present(records) for face in box_faces(record)])
 
 
 def _present(records: npt.NDArray[Any]) -> npt.NDArray[Any]:
