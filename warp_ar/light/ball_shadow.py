@@ -1,14 +1,15 @@
 """Test that recovered light reaches the ball, using the surface around the ball's own shadow.
 
-The card measures how much light is missing, and shading its directions. But light on them need not reach the ball:
-unmodelled clutter may occlude it there, and clipped light in the ball may not be the light on the card. Light that
-passes close to the ball falls on the planes next to its shadow, and light that is occluded at the ball is missing there
-too. With e the captured irradiance, a the irradiance that an estimate adds and f the share of a that reaches the ball,
-a point of a plane shows
+The card measures how much light is missing, and the shading of other surfaces measures its directions. But light on
+these surfaces need not reach the ball: unmodelled clutter may occlude it there, and clipped light in the ball may not
+be the light on the card. Light that passes close to the ball falls on the planes next to its shadow, and light that is
+occluded at the ball is missing there too. Let e be the captured irradiance, a the irradiance that an estimate adds, and
+f the share of a that reaches the ball. A point of a plane then has the radiance L with
 
     log L = level + log(e + f a) + texture.
 
-Two groups of points determine f, each relative to all points of the plane at which hardly any of a passes the ball:
+Two groups of points determine f. Each is compared with those points of the plane at which hardly any of a passes the
+ball:
 
 - **Next to the shadow**, within two radii of the ball: the level is that of the plane elsewhere, where f = 1. These
   points measure whether the light is there at all. An occluder on both sides of the shadow also occludes the ball
@@ -22,9 +23,9 @@ Two groups of points determine f, each relative to all points of the plane at wh
 
   so that f + 3/8 (1 - f) is used.
 
-Either group is used only if the cost, twice a negative log likelihood, decreases from f = 1 by as much as a new emitter
-needs: reliable light is kept, and without evidence nothing changes. Emitters keep their distances; a near one lights a
-plane unevenly, which is no shadow.
+Either group is used only if the cost (twice the negative log likelihood) is lower than at f = 1 by the amount that is
+required for a new emitter. Reliable light is therefore kept, and without evidence nothing changes. Emitters keep their
+distances, because a near emitter lights a plane unevenly, which must not count as a shadow.
 """
 
 from __future__ import annotations
@@ -40,9 +41,9 @@ from warp_ar.light.problem import Problem
 Array = NDArray[np.float64]
 
 ELSEWHERE = 3.0 / 8.0
-"""Best factor for light of unknown direction."""
+"""Best factor on light whose direction is wrong."""
 SHARES = np.linspace(0.0, 1.0, 41)
-"""Values of f to evaluate."""
+"""Values of f that are evaluated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,16 +57,17 @@ class Ball:
 
 
 def passing_shares(problem: Problem, unknowns: Array, ball: Ball, reach: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return the share of an estimate's light at each point whose rays pass the ball closely or hit it, (reaches, n).
-
-    The second result is the side of the ball on which the light passes within the first reach, (n,): positive if the
-    ball is on the right of a point that faces the light.
+    """Return the share of the light that an estimate adds at each point which passes close to the ball or hits it.
 
     Args:
         problem: The equations.
         unknowns: Radiance of parts, then power of candidates, (parts + candidates, 3).
         ball: The ball.
-        reach: Distances from the ball's centre, in radii, within which a ray passes closely.
+        reach: Distances from the ball's centre, in radii, within which a ray passes close to it.
+
+    Returns:
+        Shares for each reach, (reaches, n); and the side of the ball on which light passes within the first reach,
+        (n,): positive if the ball is on the right as seen from the point toward the light.
     """
     distant, near = problem.distant_radiance(unknowns), problem.near_emitters(unknowns)
     power = (distant * problem.missing).sum(axis=1) * problem.solid_angle
@@ -101,11 +103,11 @@ def costs(given: Array, scatter: float, level: float, known: float | None) -> Ar
     """Return twice the negative log likelihood of each of ``SHARES``, (shares,).
 
     Args:
-        given: Radiance, captured irradiance, added irradiance, and the number of points that share one error, for each
-            point, (4, n).
+        given: For each point: radiance, captured irradiance, added irradiance, and the number of points with which it
+            shares one error, (4, n).
         scatter: Standard deviation of the logarithm of one point's radiance.
-        level: Logarithm of radiance over irradiance of the plane elsewhere.
-        known: Standard deviation of that level here; None: the level is free.
+        level: Logarithm of radiance divided by irradiance at the plane's other points.
+        known: Standard deviation of that level at these points; None: the level is free.
     """
     shown, captured, added, shared = given
     logs = np.log(shown) - level - np.log(np.maximum(captured + SHARES[:, None] * added, 1e-9))
@@ -121,12 +123,11 @@ def costs(given: Array, scatter: float, level: float, known: float | None) -> Ar
 
 
 def share_told(cost: Array, sides: Array | None = None) -> float:
-    """Return a lower bound of f, which holds with most of the likelihood; 1 without sufficient evidence.
+    """Return a lower bound of f, the quantile ``believed`` of its likelihood; 1 without sufficient evidence.
 
     Args:
         cost: Costs from ``costs``, (shares,).
-        sides: Costs of the points on either side of the shadow, each of which must give half of the evidence, (2,
-            shares).
+        sides: Costs of the points on each side of the shadow, (2, shares). Each side must give half of the evidence.
     """
     if cost[-1] - cost.min() < CONFIG.search.evidence:
         return 1.0
@@ -152,7 +153,7 @@ def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
     if not usable.any():
         return 1.0
     shown, captured = problem.light.sum(axis=1), problem.captured.sum(axis=1)
-    # Unusable points have no logarithm and are ignored below.
+    # Unusable points have no logarithm; they are not used below.
     ratio = np.full(len(shown), np.nan)
     ratio[usable] = np.log(shown[usable]) - np.log(np.maximum((captured + added)[usable], 1e-9))
     given = np.stack([shown, captured, added, problem.shared])
@@ -176,6 +177,6 @@ def reaching_factor(problem: Problem, unknowns: Array, ball: Ball) -> float:
 
 
 def _level(ratio: Array) -> tuple[float, float]:
-    """Return median and standard deviation of logarithms of radiance over irradiance, (n,)."""
+    """Return median and robust standard deviation of logarithms of radiance divided by irradiance, (n,)."""
     level = float(np.median(ratio))
     return level, max(1.4826 * float(np.median(np.abs(ratio - level))), CONFIG.shadow.scatter)

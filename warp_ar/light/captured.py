@@ -1,12 +1,18 @@
 """Captured light: an environment in a file, for lighting other pictures than those it was captured from.
 
-The file is an OpenEXR latlong with channels R, G, B (linear, in camera values of the shown exposure: 1 clips) and
-``confidence`` (1: seen; 0: filled from neighbours). Its attributes are ``axes``, ``chromaticities``, ``whiteLevel``
-(the value at which the capture's camera clipped), ``exposure`` (t ISO / (100 N^2), 0 if unknown), ``lowerBound`` (the
-share of the light that is a lower bound, because it clips in the shortest exposure), ``emitters`` (JSON) and, if a
-colour chart gave the colours, ``cameraColors`` (3x3: from the file's RGB, which is then Rec. 709's, to camera values).
-A file of another program lacks them: its values are read as by `exr_file.read_linear_picture`, its axes as by
-`latlong_axes.axes_of`.
+The file is an OpenEXR latlong with channels R, G, B and ``confidence`` (1: seen; 0: filled from neighbours). R, G, B
+are camera values: linear values of the shown exposure, in which the camera clips at 1. Its attributes are:
+
+- ``axes``, ``chromaticities``;
+- ``whiteLevel``: value at which the camera clipped;
+- ``exposure``: t ISO / (100 N^2); 0 if unknown;
+- ``lowerBound``: share of the light that is a lower bound, because it clips in the shortest exposure;
+- ``emitters``: bright sources, as JSON;
+- ``cameraColors``, if a colour chart gave the colours: matrix (3x3) from the file's RGB, which is then Rec. 709, to
+  camera values.
+
+A file of another program lacks these attributes. `exr_file.read_linear_picture` converts its values, and
+`latlong_axes.axes_of` finds its axes.
 """
 
 from __future__ import annotations
@@ -35,10 +41,11 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 BRIGHT = 6.0
-"""Radiance over the map's mean from which a texel is part of an emitter."""
+"""Ratio of a texel's radiance to the map's mean above which the texel is part of an emitter."""
 MOST_EMITTERS = 12
+"""Largest number of emitters that are found."""
 LEAST_SHARE = 0.01
-"""Least share of a listed emitter in the irradiance from all directions."""
+"""Smallest share of an emitter in the light from all directions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +107,7 @@ class Light:
                 raise UsageError(f"Light: {name} = {getattr(self, name)}: expected a number from 0 to {most:g}")
 
     def recolored(self, matrix: Array) -> Light:
-        """Return the light with its RGB multiplied by a matrix (3, 3); values below 0 become 0."""
+        """Return the light with its colours multiplied by a matrix (3, 3); values below 0 become 0."""
 
         def changed(value: Any) -> Any:
             return np.maximum(value @ matrix.T, 0.0)
@@ -155,8 +162,7 @@ class Light:
 
         Args:
             path: The file.
-            axes: One of ``latlong_axes.AXES``; None: those that the file states, else the convention of its format
-                (`axes_of`).
+            axes: One of ``latlong_axes.AXES``; None: the axes that the file states, or else those of its format.
 
         Raises:
             SceneError: The file cannot be used.
@@ -167,7 +173,7 @@ class Light:
         if width != 2 * height or height < 2:
             raise SceneError(f"{path} is {width}x{height}: a latlong environment is twice as wide as high")
         axes = axes_of(picture, path, axes, SceneError, str(path))
-        radiance = np.clip(picture.color, 0.0, 1e6)  # files in circulation have negative pixels
+        radiance = np.clip(picture.color, 0.0, 1e6)  # some published files have negative pixels
         header = picture.header
         confidence = np.clip(picture.others.get("confidence", np.ones((height, width), np.float32)), 0.0, 1.0)
         emitters = _parse_emitters(path, header.get("emitters", "[]"))
@@ -209,7 +215,7 @@ class Light:
         total = np.zeros((height, 2 * height, 3), np.float32)
         for dy in (0.25, 0.75):
             for dx in (0.25, 0.75):
-                d = latlong_directions(height, dy, dx) @ rotation  # the inverse: rotation^T d
+                d = latlong_directions(height, dy, dx) @ rotation  # applies the inverse rotation to each direction
                 y = np.arccos(np.clip(d[..., 2], -1.0, 1.0)) / math.pi * rows - 0.5
                 x = (np.arctan2(d[..., 1], d[..., 0]) / (2 * math.pi) + 0.5) * columns - 0.5
                 total += cv2.remap(
@@ -220,7 +226,13 @@ class Light:
 
 
 def latlong_directions(height: int, dy: float = 0.5, dx: float = 0.5) -> Array:
-    """Return unit directions (height, 2 height, 3) of a point in each texel, ``dy`` and ``dx`` from its corner."""
+    """Return the unit direction of a point in each texel of a latlong map with z up, (height, 2 height, 3).
+
+    Args:
+        height: Rows of the map.
+        dy: Distance of the point from the texel's upper edge, in texels.
+        dx: Distance of the point from the texel's left edge, in texels.
+    """
     theta = (np.arange(height) + dy)[:, None] * (math.pi / height)
     phi = (np.arange(2 * height) + dx)[None, :] * (math.pi / height) - math.pi
     s = np.sin(theta)
@@ -228,13 +240,13 @@ def latlong_directions(height: int, dy: float = 0.5, dx: float = 0.5) -> Array:
 
 
 def texel_solid_angles(height: int) -> Array:
-    """Return the solid angle in steradians of a texel of each row, (height, 1)."""
+    """Return the solid angle in steradians of a texel in each row of a latlong map, (height, 1)."""
     edges = np.cos(np.arange(height + 1) * math.pi / height)
     return np.asarray((edges[:-1] - edges[1:])[:, None] * (math.pi / height))
 
 
 def irradiance_above(radiance: Map) -> Array:
-    """Return the irradiance (3,) of a level plane under a latlong map whose z is up, (height, 2 height, 3)."""
+    """Return the irradiance, (3,), of a horizontal plane under a latlong map with z up, (height, 2 height, 3)."""
     height = len(radiance)
     weight = np.maximum(latlong_directions(height)[..., 2:], 0.0) * texel_solid_angles(height)[..., None]
     return np.asarray((weight * radiance).sum((0, 1)), float)
@@ -247,9 +259,9 @@ def find_emitters(
 
     Args:
         radiance: Latlong map, (height, 2 height, 3).
-        clipped: Share of each texel that clips in every exposure, same shape.
+        clipped: Share of each texel that clips in every exposure, (height, 2 height, 3).
         error: Relative error of radiance that does not clip.
-        captured: Map before clipped radiance was raised; lower ends of intervals are taken from it. None: ``radiance``.
+        captured: Map without recovered light, which gives the lower ends of intervals; None: ``radiance``.
     """
     captured = radiance if captured is None else captured
     height = len(radiance)
@@ -313,15 +325,15 @@ def has_places(path: str | Path) -> bool:
         header = read_exr_header(path, SceneError, str(path))
         return any(emitter.distance is not None for emitter in _parse_emitters(path, header.get("emitters", "[]")))
     except SceneError:
-        return False  # reading the light reports the reason
+        return False  # the error is reported when the light is read
 
 
 def placed_emitters(light: Light, scale: float, rotation: Array, most: int) -> list[dict[str, Any]]:
-    """Return fields of ``kernels.structs.Emitter`` for the emitters of known distance.
+    """Return the fields of ``kernels.structs.Emitter`` for each emitter of known distance.
 
     Args:
         light: Light as it was read.
-        scale: Factor to the camera values of the frames.
+        scale: Factor from the light's values to camera values of the frames.
         rotation: Rotation from the light's axes to the scene's, (3, 3).
         most: Largest number of emitters; the most powerful are kept.
     """

@@ -1,17 +1,22 @@
 """Light without a mirror ball, estimated from the card, planes and boxes of a frame, with its uncertainty.
 
-The environment is ``ROWS`` x 2 ``ROWS`` cells of constant radiance x. A point p of a surface of reflectance rho shows
+The environment is divided into ``ROWS`` x 2 ``ROWS`` cells; cell c has the constant radiance x_c. A point p of a
+surface of reflectance rho has the radiance
 
-    r_p = rho / pi sum_c x_c max(n_p . d_c, 0) V_pc w_c,
+    r_p = rho / pi sum_c x_c max(n_p . d_c, 0) V_pc w_c
 
-w_c is the solid angle of a cell; V_pc is 1 where no box occludes it. The card's white is known; other reflectances are
-estimated from the light, in alternation with it. Directions that the frame shows have the radiance in the frame. The
-prior of a cell's radiance has the mean m, which is that of the card and, below the horizon, as bright as the table, and
-the covariance P by ``SPREAD`` and ``REACH``. With rows A, values b and noise S the light is the x >= 0 that minimises
-(x - m)' P^-1 (x - m) + (A x - b)' S^-1 (A x - b); its covariance is (P^-1 + A' S^-1 A)^-1.
+where n_p is its normal, d_c the direction of cell c, w_c the cell's solid angle, and V_pc is 0 where a box occludes the
+cell, else 1. The reflectance of the card's paper is known. Those of other surfaces and the light are estimated in
+alternation. Cells that the frame shows are measured directly.
 
-A flat card does not measure light from the horizon. ``SIDES`` is the assumed share of light from near the horizon. If
-no face of a box is visible, it gives an upright face the irradiance of a flat one, as under constant light.
+The prior on x has the mean m and the covariance P. Above the horizon, m is the mean radiance that the card measures;
+below it, m is the radiance of the table. P follows from ``SPREAD`` and ``REACH``. Let A x = b be the equations and S
+the covariance of their noise. The light is the x >= 0 that minimises (x - m)' P^-1 (x - m) + (A x - b)' S^-1 (A x - b);
+its covariance is (P^-1 + A' S^-1 A)^-1.
+
+A flat card hardly measures light from near the horizon. ``SIDES`` is the assumed share of that light. Its value for a
+frame without a visible face of a box is such that an upright and a flat surface have equal irradiance, as under
+constant light.
 """
 
 from __future__ import annotations
@@ -36,12 +41,13 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 ROWS: Final = 8
+"""Rows of cells from zenith to nadir."""
 SIDES: Final = (0.9, 0.3)
 """Prior share of the card's light from near the horizon: without a visible face of a box, and with one."""
 NEAR_HORIZON: Final = 0.25
 """Sine of the height above the horizon at which the light from near the horizon has fallen to 1 / e."""
 SPREAD: Final = (0.7, 0.4)
-"""Prior relative standard deviation of a cell above and below the horizon."""
+"""Relative standard deviation of the prior on a cell's radiance, above and below the horizon."""
 REACH: Final = 0.8
 """Angle in radians at which the correlation of cells has fallen to 1 / e."""
 NOISE: Final = {Kind.CARD: 0.02, Kind.PLANE: 0.1, Kind.FACE: 0.05}
@@ -51,31 +57,31 @@ INDEPENDENT: Final = 4
 SEEN: Final = 0.2
 """Relative standard deviation of a cell that is partly visible in the frame."""
 CLIPPED: Final = 250
-"""Code from which a channel counts as clipped and is not used."""
+"""8-bit code from which a channel counts as clipped and is not used."""
 EXCESS: Final = 1.3
-"""Factor on the light of a clipped card."""
+"""Factor on the light measured by a card that clips, because it is a lower bound."""
 STEP: Final = 12
-"""Pixels between examined directions."""
+"""Distance in pixels between the directions at which the frame is read."""
 CENTER: Final = (0.0, 0.0, 0.05)
 """Position for which the light is estimated, metres: above the card, where objects stand."""
 TURNS: Final = 6
 """Number of alternations between reflectances and light."""
 WITHIN: Final = 7.5
-"""Standard deviations within which nine tenths of the errors lie on desks of known light: most of an error is not noise
-but light from directions that no surface faces."""
+"""Number of estimated standard deviations within which nine tenths of the errors lie, measured on desks of known light.
+It is large because most of an error is not noise, but light from directions that no surface faces."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CardLight:
-    """Light of one frame for irradiance: of second order, with one main direction."""
+    """Coarse environment of one frame for irradiance, which depends only on spherical harmonics up to order two."""
 
     radiance: npt.NDArray[np.float32]
-    """Latlong radiance, z up, (``ROWS``, 2 ``ROWS``, 3), camera values."""
+    """Latlong radiance, z up, (``ROWS``, 2 ``ROWS``, 3), in units of the camera's clipping."""
     covariance: Array
-    """Covariance of the cells, by channel, (3, cells, cells)."""
+    """Covariance of the cells' radiance, by channel, (3, cells, cells)."""
 
     def irradiance(self, normals: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return the irradiance of surfaces with normals ``normals``, and half its 90 % interval, (n, 3)."""
+        """Return the irradiance of surfaces with normals (n, 3), and half its 90 % interval, (n, 3) each."""
         directions, angles = _cells()
         weights = np.maximum(np.asarray(normals, np.float64) @ directions.T, 0.0) * angles
         variance = np.einsum("nc,kcd,nd->nk", weights, self.covariance, weights)
@@ -83,19 +89,19 @@ class CardLight:
 
     @property
     def main_direction(self) -> Array:
-        """Return the unit direction from which most of the light comes, (3,)."""
+        """Unit vector in the direction of the mean of the light, (3,)."""
         directions, angles = _cells()
         sum_: Array = (self.radiance.reshape(-1, 3).mean(axis=1) * angles) @ directions
         return sum_ / max(float(np.linalg.norm(sum_)), 1e-12)
 
     @property
     def latlong(self) -> npt.NDArray[np.float32]:
-        """Return the radiance at the size of an environment's file, (32, 64, 3)."""
+        """Radiance repeated to the size of a file of captured light, (32, 64, 3)."""
         return np.repeat(np.repeat(self.radiance, 32 // ROWS, axis=0), 32 // ROWS, axis=1)
 
     @property
     def words(self) -> str:
-        """Return one line of text with the irradiance from above, its interval, and the main direction of the light."""
+        """Line of text with the irradiance from above, its interval, and the main direction of the light."""
         value, half = (float(part.mean()) for part in self.irradiance(np.array([[0.0, 0.0, 1.0]])))
         x, y, z = self.main_direction
         told = f"from above {value:.2f} +- {half:.2f} camera values, mainly from ({x:.2f}, {y:.2f}, {z:.2f})"
@@ -106,7 +112,7 @@ def light_by_card(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> Car
     """Estimate the light from the surfaces in a frame.
 
     Args:
-        image: RGB codes, (height, width, 3).
+        image: uint8 RGB, (height, width, 3).
         scene: Scene with a marker, planes and boxes; its camera has the frame's size.
         pose: ``camera_from_world``.
 
@@ -124,13 +130,14 @@ def light_by_card(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> Car
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Shown:
-    """Values that a frame shows at surface points, and in directions of the environment."""
+    """Linear values that a frame shows at surface points, and in directions of the environment."""
 
     values: Array
     """Linear values at points, (n, 3)."""
     exact: Mask
     """True where values do not clip, (n, 3)."""
     kind: npt.NDArray[np.int64]
+    """``Kind`` of each point's surface."""
     group: npt.NDArray[np.int64]
     """Index of each point's surface; 0 is the card."""
     transfer: Array
@@ -170,7 +177,13 @@ def _look(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> _Shown:
 
 
 def _solve(shown: _Shown, white: float, channel: int) -> tuple[Array, Array]:
-    """Return the radiance of the cells in one channel, and its covariance."""
+    """Return the radiance of the cells in one channel, (cells,), and its covariance.
+
+    Args:
+        shown: Values of the frame.
+        white: Reflectance of the card's paper.
+        channel: Index of the channel.
+    """
     directions, angles = _cells()
     exact, values = shown.exact[:, channel].copy(), shown.values[:, channel]
     card = shown.group == 0
@@ -210,7 +223,10 @@ def _solve(shown: _Shown, white: float, channel: int) -> tuple[Array, Array]:
 
 
 def _cells() -> tuple[Array, Array]:
-    """Return directions (cells, 3) and solid angles (cells,) of cells; rows from +z down, columns from -x through y."""
+    """Return directions, (cells, 3), and solid angles, (cells,), of the cells.
+
+    Rows run from +z to -z; columns from -x through -y, +x and +y.
+    """
     theta = (np.arange(ROWS) + 0.5) / ROWS * np.pi
     phi = ((np.arange(2 * ROWS) + 0.5) / ROWS - 1.0) * np.pi
     theta, phi = (part.ravel() for part in np.meshgrid(theta, phi, indexing="ij"))
@@ -229,13 +245,19 @@ def _cell_of(directions: Array) -> npt.NDArray[np.int64]:
 
 
 def _blur(image: npt.NDArray[np.uint8], decode: Array) -> tuple[Array, Mask]:
-    """Return linear values as means of 5 x 5 pixels, and a mask of means without clipped pixels."""
+    """Return linear values as means of 5 x 5 pixels, (h, w, 3), and a mask of the means without clipped pixels."""
     linear = np.stack([decode[image[..., c], c] for c in range(3)], -1)
     return cv2.blur(linear, (5, 5)), cv2.blur((image >= CLIPPED).astype(np.float32), (5, 5)) == 0.0
 
 
 def _hidden(points: Array, directions: Array, proxies: tuple[Proxy, ...]) -> Mask:
-    """Return a mask, (n, m), of directions (1 or n, m, 3) in which boxes occlude the environment at points (n, 3)."""
+    """Return a mask, (n, m), of the directions in which a box occludes the environment.
+
+    Args:
+        points: Points, (n, 3).
+        directions: Directions for all points, (1, m, 3), or for each, (n, m, 3).
+        proxies: Proxies, of which the static boxes are used.
+    """
     found = np.zeros((len(points), directions.shape[1]), bool)
     for box in proxies:
         if box.shape == "box" and box.marker is None:

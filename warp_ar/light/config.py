@@ -1,4 +1,8 @@
-"""Parameters of the recovery of clipped light: assumptions, search ranges and tolerances, with their units."""
+"""Parameters of the recovery of clipped light: assumptions, search ranges and tolerances, with their units.
+
+The module ``recovery`` explains the terms. A region is a part of the clipped light in the environment map. A component
+is a connected set of clipped cells, which is split into regions. A candidate is an emitter that may be within it.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,13 @@ class Kind(enum.IntEnum):
     """Kind of surface."""
 
     CARD = 0
-    """White paper: its reflectance is known."""
+    """White paper, of known reflectance."""
     INK = 1
-    """The marker's black cells."""
+    """Black cells of the marker."""
     PLANE = 2
-    """A plane proxy, textured as tables are."""
+    """Plane proxy, which may be textured like a table."""
     FACE = 3
-    """One face of a box proxy."""
+    """Face of a box proxy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,42 +28,45 @@ class SurfaceConfig:
     """Sampling of surfaces, and priors on them; tuples are indexed by ``Kind``."""
 
     grid: float = 0.06
-    """Metres between points on planes."""
+    """Distance in metres between points on planes."""
     planes: int = 8
-    """Largest number of planes in use, which bounds the cost for scenes of many proxies."""
+    """Largest number of planes with points, which bounds the cost for scenes of many proxies."""
     plane_points: int = 2000
-    """Largest number of points on all planes."""
+    """Largest number of points on all planes together."""
     boxes: int = 16
-    """Largest number of boxes in use."""
+    """Largest number of boxes with points."""
     box_points: int = 1536
-    """Largest number of points on all boxes."""
+    """Largest number of points on all boxes together."""
     face_steps: int = 5
     """Largest number of points along either side of a box's face."""
     noise: tuple[float, ...] = (0.02, 0.04, 0.12, 0.04)
-    """Relative standard deviation of an equation, by kind, for surfaces whose points scatter by at least as much, or
-    are too few to measure the scatter."""
+    """Largest relative standard deviation of an equation, by kind. It is used for surfaces whose points scatter as
+    much, or are too few to measure the scatter."""
     least_noise: float = 0.015
-    """Least relative standard deviation, for an even surface: error of the transport model."""
+    """Smallest relative standard deviation of an equation, for an even surface: the error of the transport model."""
     scatter_points: int = 12
-    """Least number of a surface's points for a measurement of their scatter."""
+    """Smallest number of a surface's points for a measurement of their scatter."""
     scatter_iterations: int = 5
-    """Iterations of reweighting, which exclude shadows and stains from the scatter."""
+    """Number of iterations of reweighting, which exclude shadows and stains from the scatter."""
     shared: tuple[float, ...] = (4.0, 8.0, 2.0, 3.0)
     """Number of equations, by kind, that share one error of the transport model."""
     texture: tuple[float, ...] = (0.0, 0.0, 0.03, 0.03)
-    """Distance in metres within which texture varies little, by kind; closer points share its error as well."""
+    """Distance in metres within which texture varies little, by kind; closer points share the error by texture."""
     reflectance: tuple[float, ...] = (0.85, 0.045, 0.35, 0.35)
-    """Expected reflectance, by kind; a scene states the card's. Black print has densities of 1 to 1.5."""
+    """Expected reflectance, by kind; a scene states that of the card. Black print has optical densities of 1 to 1.5."""
     reflectance_spread: tuple[float, ...] = (0.005, 0.3, 0.6, 0.6)
-    """Standard deviation of the reflectance's logarithm, by kind. Where paper clips, ink measures light."""
+    """Standard deviation of the logarithm of reflectance, by kind. Ink has one because it measures light where paper
+    clips."""
     hue_spread: tuple[float, ...] = (0.005, 0.1, 0.4, 0.4)
-    """Standard deviation of the logarithm of the ratio of two channels' reflectances: paper is white and ink grey."""
+    """Standard deviation of the logarithm of the ratio between two channels' reflectances, by kind: paper and ink are
+    nearly neutral."""
     tie: float = 0.06
-    """Relative standard deviation between the reflectances of one box's faces."""
+    """Relative standard deviation between the reflectances of a box's faces."""
     mirror_trust: float = 0.5
-    """Relative standard deviation of light reflected by a ball: dents, scratches and dust scatter it."""
+    """Relative standard deviation of light that a ball reflects onto surfaces, because dents, scratches and dust
+    scatter it."""
     dark: float = 0.005
-    """pi times radiance below which a point is not used, because of quantisation."""
+    """Value of pi times radiance below which a point is not used, because of quantisation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,79 +74,82 @@ class PriorConfig:
     """Priors on light that clips."""
 
     region: float = 0.12
-    """Solid angle in steradians above which a region is split; this one is 22 degrees wide."""
+    """Largest solid angle of a region in steradians, which is 22 degrees wide; a larger component is split."""
     exponent: float = -0.5
-    """Exponent of the solid angle in a component's expected radiance."""
+    """Exponent of the solid angle in a component's expected missing radiance."""
     least_alike: float = 0.05
-    """Least expected missing light of a component, relative to a component that clips in all channels."""
+    """Smallest expected missing radiance of a component, relative to a component that clips in all channels."""
     fades: tuple[float, float] = (0.6, 0.7)
-    """Radiance next to clipped cells over clipping: boundaries are sharp below the first, faded at the second."""
+    """Radiance of cells next to clipped ones, relative to the clipping level: a boundary is sharp below the first
+    number, and fading above the second."""
     depth: float = 1.0
-    """Radians inside a fading boundary up to which missing radiance grows."""
+    """Angle in radians from a fading boundary up to which missing radiance grows."""
     spread: float = 0.8
-    """Relative standard deviation of components from the common mean."""
+    """Relative standard deviation of a component's mean from the common mean."""
     inside: float = 0.7
     """Relative standard deviation of regions from their component's mean."""
     hue: float = 0.5
-    """Relative standard deviation of a channel's distribution from that of all channels."""
+    """Relative standard deviation of a channel's distribution over regions from that of all channels."""
     least: float = 0.3
-    """Radiance below which deviations count as absolute, not relative."""
+    """Radiance below which standard deviations are absolute, not relative."""
     surface_recovered: float = 0.5
-    """Standard deviation of the radiance above clipping on modelled surfaces."""
+    """Standard deviation of the missing radiance of modelled surfaces that clip."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LeastConfig:
-    """Parameters of the least missing radiance, when only the map is known (``priors.least_missing``)."""
+    """Parameters of the radiance that is added if only the map is known (``priors.least_missing``)."""
 
     least: float = 1.25
-    """Added radiance of light clipped in all channels, over the clipping level, if one steradian clips."""
+    """Radiance added to light that clips in all channels, relative to the clipping level, if one steradian clips."""
     exponent: float = 0.25
     """Exponent of the clipped solid angle in the added radiance."""
     most: float = 1.0
-    """Steradians of clipping from which the added radiance is constant: a wholly clipped sky may be even."""
+    """Clipped solid angle in steradians above which the added radiance does not grow, because a wholly clipped sky may
+    be hardly brighter than clipping."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
-    """Search for emitters."""
+    """Parameters of the search for emitters."""
 
     evidence: float = 7.0
-    """Least decrease of the cost (twice a negative log likelihood) for an added candidate."""
+    """Smallest decrease of the cost (twice the negative log likelihood) for which a candidate is added."""
     even: float = 1.6
-    """Ratio of the surfaces' scatter to the expected scatter, above which they count as textured."""
+    """Ratio of the surfaces' scatter to the expected scatter, above which the surfaces count as textured."""
     textured: float = 4.0
-    """Exponent of that ratio over ``even`` in the least decrease on textured surfaces."""
+    """Exponent on textured surfaces: ``evidence`` is multiplied by (ratio / ``even``) to this power."""
     better: float = 0.1
-    """Least decrease of the cost for moving a new candidate to a neighbouring place."""
+    """Smallest decrease of the cost for which a new candidate is moved to a neighbouring place."""
     worth_moving: float = 1.0
-    """Least decrease of the cost for moving a known candidate: emitters do not move, and views differ by noise.
+    """Smallest decrease of the cost for which a known candidate is moved: emitters do not move, and views differ by
+    noise.
 
-    With the value of ``better``, an emitter of ``torus`` moves to the place of another that is switched on, 0.25 m from
-    the ball.
+    With the value of ``better``, an emitter of the clip ``torus`` would move to another one that is switched on, 0.25 m
+    from the ball.
     """
     most: int = 4
     """Largest number of candidates at a time."""
     every: int = 2
-    """Estimates between searches for one more candidate; the first estimate searches for all."""
+    """Number of estimates between searches for one more candidate; the first estimate searches for all."""
     later_every: int = 6
-    """Estimates between searches after ``settled`` estimates."""
+    """Number of estimates between searches after the first ``SolverConfig.settled`` estimates."""
     candidates: int = 160
-    """Directions tried for a candidate in the first estimate."""
+    """Number of directions in which a candidate is tried in the first estimate."""
     later_candidates: int = 40
-    """Directions tried in a later search, different ones in each."""
+    """Number of directions that a later search tries; each search tries others."""
     distances: tuple[float, ...] = (2.0, 1.2, 0.8, 0.6, 0.45, 0.35)
-    """Distances of an emitter from the ball to try, metres, besides infinity."""
+    """Distances of an emitter from the ball that are tried, metres, in addition to infinity."""
     nearest: float = 0.25
-    """Least distance of an emitter from the ball, metres; a closer one would be visible in the picture."""
+    """Smallest distance of an emitter from the ball, metres; a closer one would be visible in the picture."""
     farthest: float = 3.0
-    """Distance, metres, at which the prior on an emitter's distance stops growing."""
+    """Distance in metres at which the prior on an emitter's distance stops growing."""
     angle: float = 0.12
-    """Radians around a candidate's direction within which cells share its light."""
+    """Angle in radians around a candidate's direction within which cells share its light."""
     stray: float = 0.05
-    """Largest share of a spot's clipped light around it: glare, and cells at its edge."""
+    """Largest clipped light around a spot, relative to that of the spot, caused by glare and cells at its edge."""
     radius_share: float = 0.06
-    """Radius of an emitter over its distance: a disc as wide as a cell."""
+    """Radius of an emitter relative to its distance: a disc as wide as a cell."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,33 +157,33 @@ class SolverConfig:
     """Numbers of iterations, and conditions for a new solution."""
 
     iterations: int = 6
-    """Iterations of reweighting from a start that is not a solution."""
+    """Number of iterations of reweighting from a start that is not a solution."""
     warm_iterations: int = 3
-    """Iterations of reweighting from the solution of a similar problem."""
+    """Number of iterations of reweighting from the solution of a similar problem."""
     halvings: int = 4
     """Largest number of halvings of a step that increases the cost."""
     settled: int = 10
-    """Number of estimates, from several views, after which emitters and constant light count as known."""
+    """Number of estimates after which emitters count as known, and estimates are left out while light is constant."""
     still: float = 0.02
     """Relative change of surfaces or environment below which the light counts as unchanged."""
     remembered: int = 12
     """Largest number of estimates in a mean while the light is unchanged."""
     sudden: float = 0.25
-    """Relative change that starts a new solution at once; smaller changes wait for one more estimate."""
+    """Relative change from which a new solution starts at once; smaller changes wait for one more turn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CardConfig:
-    """Conditions for using a card's white."""
+    """Conditions under which the card's paper is used."""
 
     least_cells: int = 4
-    """Least number of visible white cells, and of ink cells."""
+    """Smallest number of visible white cells, and of visible ink cells."""
     least_contrast: float = 2.5
-    """Least median ratio of paper to ink: print has 10 to 30, and blur and veiling glare reduce it."""
+    """Smallest median ratio of paper to ink. Print has 10 to 30; blur and veiling glare reduce it."""
     darker: float = 1.6
-    """Ratio from which an ink cell counts as darker than the adjacent paper."""
+    """Ratio of paper to ink from which an ink cell counts as darker than the adjacent paper."""
     least_share: float = 0.75
-    """Least share of ink cells that are darker."""
+    """Smallest share of ink cells that must be darker than the adjacent paper."""
     held: int = 15
     """Number of estimates, about five a second, for which recovered light is kept while the card is hidden."""
 
@@ -185,27 +195,30 @@ class EvidenceConfig:
     directions: int = 32
     """Number of directions in which irradiance is compared."""
     lever: float = 2.0
-    """Largest ratio of the missing share in the light from all directions to that at the card, which measures light at
-    grazing angles poorly."""
+    """Largest ratio of the share that is missing in the light from all directions to the share that is missing at the
+    card. The two differ because the card measures light at grazing angles poorly."""
     response: float = 0.016
-    """Standard deviation of the logarithm of the response's exponent."""
+    """Standard deviation of the logarithm of the exponent of the camera's response."""
     white: float = 0.016
     """Standard deviation of the logarithm of the card's reflectance."""
     ball: float = 0.016
     """Standard deviation of the logarithm of the ball's reflectance."""
     usual_contrast: float = 30.0
-    """Largest paper to ink ratio of known prints; a larger one shows that the response is steeper than assumed."""
+    """Largest ratio of paper to ink of known prints; a larger one shows that the response is steeper than assumed."""
     doubt: float = 2.0
-    """Standard deviation of the logarithm of the card's radiance, per unit of log contrast above ``usual_contrast``."""
+    """Standard deviation of the logarithm of the card's radiance, per unit of the logarithm of the contrast's ratio to
+    ``usual_contrast``, if that is above 1."""
     found: float = 0.75
     """Relative error of the recovered light, in both directions."""
     capture: float = 0.35
-    """Relative error of captured irradiance, downward: reflectance of the ball, the unseen cone, response. This bound,
-    ``overlooked`` and ``clipped`` hold in 19 of 20 tables of ``bench_never_worse``."""
+    """Largest relative excess of captured irradiance over the truth, by the ball's reflectance, the directions that the
+    ball does not show, and the response. This bound, ``overlooked`` and ``clipped`` hold in 19 of 20 tables of
+    ``bench_never_worse``."""
     overlooked: float = 2.0
-    """Relative error of captured irradiance, upward: emitters smaller than the ball's pixels, or clipping unnoticed."""
+    """Largest relative amount by which captured irradiance is too low, because emitters are smaller than the ball's
+    pixels or clip unnoticed."""
     clipped: float = 250.0
-    """Largest mean radiance of clipped light without other evidence; 19 of 20 rooms have less."""
+    """Largest mean radiance of clipped light without other evidence; 19 of 20 environments have less."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,25 +226,29 @@ class ShadowConfig:
     """Parameters of the test that recovered light reaches the ball (``ball_shadow.py``)."""
 
     near: float = 2.0
-    """Distance in radii within which a ray passes close to the ball, for points next to the ball's shadow."""
+    """Distance from the ball's centre, in radii, within which a ray passes close to the ball, for points next to its
+    shadow."""
     near_share: float = 0.5
-    """Least share of rays within ``near`` in the light added at a tested point."""
+    """Smallest share of the added light that passes within ``near``, at points next to the shadow."""
     across: float = 3.5
-    """Distance in radii within which a ray passes the ball, for points that measure the shadow's contrast."""
+    """Distance from the ball's centre, in radii, within which a ray passes the ball, for points that measure the
+    shadow's contrast."""
     elsewhere: float = 0.1
-    """Largest share of rays within ``near`` or ``across`` at points outside the shadow, which measure its plane."""
+    """Largest share of the added light that passes within ``near`` or ``across``, at the points outside the shadow with
+    which others are compared."""
     points: int = 8
-    """Least number of points next to the shadow, and of those outside it."""
+    """Smallest number of points next to the shadow, and of points outside it."""
     believed: float = 0.1
-    """Quantile of the likelihood from which the share of light is taken."""
+    """Quantile of the likelihood that is used as the share of light reaching the ball."""
     scatter: float = 0.05
-    """Least standard deviation of the logarithm of a point's radiance: error of the transport model.
+    """Smallest standard deviation of the logarithm of a point's radiance: the error of the transport model.
 
-    With values from 0.03 to 0.08 the same tables of ``bench_never_worse`` improve by this test."""
+    With values from 0.03 to 0.08, the test improves the same tables of ``bench_never_worse``."""
     level: float = 0.05
-    """Least standard deviation of the logarithm of a plane's level between places, besides its points' scatter."""
+    """Standard deviation of the logarithm of a plane's reflectance between places, in addition to its points'
+    scatter."""
     iterations: int = 8
-    """Iterations of reweighting."""
+    """Number of iterations of reweighting."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,13 +12,13 @@ their sum. Its existence is decided by the median of their decreases, so that tw
 light clip in a channel, its cost hardly decreases; a single channel is outvoted.
 
 **Distances.** The distance of an emitter is determined by the falloff of its light, often weakly: the costs of a lamp
-in the clip ``desk`` differ by less than one between 0.3 m and 1.2 m. A near emitter changes the light of all points
-away from the ball. Emitters may be anywhere in a room, and a cell of directions and relative distance has a volume
-proportional to d^3. So each cost is reduced by
+in the clip ``desk`` differ by less than one between 0.3 m and 1.2 m. A prior therefore matters. Emitters may be
+anywhere in a room, so their density per volume is taken as constant. An interval of directions and relative distances
+has a volume proportional to d^3 at the distance d. Each cost is therefore reduced by
 
     2 log d^3 = 6 log d
 
-with d at most ``farthest``. If the falloff determines the distance within a tenth, this moves it by 3 %.
+with d at most ``farthest``. If the falloff determines the distance within a tenth, the prior moves it by 3 %.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ Array = NDArray[np.float64]
 
 
 STEP = 1.1
-"""Ratio of neighbouring trial distances."""
+"""Ratio of neighbouring distances in the search along a direction."""
 MOST_STEPS = 4
-"""Largest number of steps of ``STEP`` from the result of the grid search."""
+"""Largest number of steps by ``STEP`` from the result of the search on a grid."""
 
 
 def room(distance: float) -> float:
@@ -47,23 +47,31 @@ def room(distance: float) -> float:
 
 
 class EmitterSearch:
-    """Adds emitters to a problem's unknowns and moves them, using all channels."""
+    """Search that adds emitters to a problem's unknowns and moves them, using all channels."""
 
     def __init__(self, problem: Problem, means: Array) -> None:
-        """Start a search in ``problem``; ``means`` (3,) is the common missing radiance that the card alone implies."""
+        """Prepare a search.
+
+        Args:
+            problem: The equations, to which candidates are added.
+            means: Common mean of the missing radiance that the card alone implies, per channel, (3,).
+        """
         self.problem, self.means = problem, means
         search = CONFIG.search
         self.evidence = search.evidence * max(problem.texture / search.even, 1.0) ** search.textured
-        """Least decrease of the cost for an emitter; larger on textured surfaces, because stains look like shadows."""
+        """Smallest decrease of the cost for an emitter. It is larger on textured surfaces, where stains look like
+        shadows."""
 
     def fit_anew(self) -> Fits:
-        """Fit all channels, starting from the solution by the card alone."""
+        """Return the solution of all channels, starting from the one that the card alone implies."""
         return fit_channels(self.problem, self.problem.start(self.means), CONFIG.solver.iterations)
 
     def gains(self, fits: Fits, columns: Array) -> Array:
-        """Return each channel's decrease of cost, to second order, by each of ``columns`` as an added unknown, (3, q).
+        """Return the decrease of each channel's cost, to second order, by each of q candidates alone, (3, q).
 
-        ``columns``, (points, q), is the irradiance of each point per unit power of q candidates.
+        Args:
+            fits: Solution without the candidates.
+            columns: Irradiance of each point per unit power of each candidate, (points, q).
         """
         equations, found = fits.equations, []
         for c in range(3):
@@ -78,7 +86,7 @@ class EmitterSearch:
         return np.array(found)
 
     def costs_at(self, places: Sequence[Candidate], fits: Fits) -> Array:
-        """Return the mean of the costs with one more candidate at each place, minus ``room``, (places,)."""
+        """Return the channels' mean cost with one more candidate, minus ``room``, for each place of it, (places,)."""
         z = np.insert(fits.z, self.problem.first_mean, 0.0, axis=1)
         tried = np.tile(z, (len(places), 1))
         light, iterations = self.problem.light_of(places), CONFIG.solver.warm_iterations
@@ -86,7 +94,16 @@ class EmitterSearch:
         return np.asarray(cost.reshape(-1, 3).mean(axis=1) - [room(place.distance) for place in places], np.float64)
 
     def add_candidate(self, fits: Fits, candidates: Sequence[Candidate], columns: Array) -> Fits | None:
-        """Add the best candidate if the cost decreases enough; return the new fits, or None."""
+        """Add the best of some candidates, if the cost decreases enough.
+
+        Args:
+            fits: Solution without them.
+            candidates: Candidates to choose from.
+            columns: Irradiance of each point per unit power of each candidate, (points, q).
+
+        Returns:
+            Solution with the candidate; None if none was added.
+        """
         gain, tried = np.median(self.gains(fits, columns), axis=0), list[Candidate]()
         for place in np.argsort(-gain, kind="stable"):
             one = candidates[place]
@@ -107,9 +124,13 @@ class EmitterSearch:
         return added
 
     def settled(self, candidate: Candidate, cost: float, fits: Fits, least: float) -> Candidate:
-        """Return the best place near a candidate that is not among the unknowns of ``fits`` and has the cost ``cost``.
+        """Return the best place near a candidate.
 
-        A step must decrease the cost by more than ``least``.
+        Args:
+            candidate: The candidate, which is not among the unknowns of ``fits``.
+            cost: Cost with the candidate, from ``costs_at``.
+            fits: Solution without the candidate.
+            least: Decrease of the cost that each step must exceed.
         """
         for _ in range(2):
             around = self.neighbours(candidate)
@@ -122,13 +143,13 @@ class EmitterSearch:
         if self.problem.trace is not None:
             others = [Candidate(candidate.cell, distance) for distance in (np.inf, *CONFIG.search.distances)]
             candidate, cost = self._best_of(others, candidate, cost, fits, least)
-        # Costs that differ by less than one standard deviation do not determine the distance.
+        # A difference of the cost below one standard deviation does not determine the distance.
         return self._at_its_distance(candidate, cost, fits, max(least, CONFIG.search.worth_moving))
 
     def _best_of(
         self, places: Sequence[Candidate], candidate: Candidate, cost: float, fits: Fits, least: float
     ) -> tuple[Candidate, float]:
-        """Return the best place and its cost; the candidate itself if none decreases it by more than ``least``."""
+        """Return the best of some places and its cost, or the candidate if none decreases it by more than ``least``."""
         for place, other in zip(places, self.costs_at(places, fits), strict=True):
             if other < cost - least:
                 candidate, cost = place, float(other)
@@ -137,9 +158,10 @@ class EmitterSearch:
     def _at_its_distance(self, candidate: Candidate, cost: float, fits: Fits, least: float) -> Candidate:
         """Return the candidate at the distance of least cost along its direction.
 
-        The second-order decrease by which ``settled`` chooses places is inaccurate far from a solution with the
-        candidate, and may prefer wrong distances. Here every place is evaluated: steps of ``STEP`` downhill while they
-        decrease the cost by more than ``least``, then the minimum of the parabola through the last three.
+        ``settled`` chooses places by the decrease to second order, which is inaccurate far from a solution with the
+        candidate and may prefer wrong distances. Here the cost is computed at each distance. Steps by ``STEP`` are made
+        while they decrease the cost by more than ``least``; the result is the minimum of a parabola through the last
+        three distances.
         """
         if self.problem.trace is None or not np.isfinite(candidate.distance):
             return candidate
@@ -189,7 +211,13 @@ class EmitterSearch:
         return found
 
     def find_candidates(self, most: int, *, places: int = CONFIG.search.candidates, turn: int = 0) -> None:
-        """Add up to ``most`` candidates to the problem. Each ``turn`` tries other directions."""
+        """Add candidates to the problem, one by one.
+
+        Args:
+            most: Largest number of candidates to add.
+            places: Number of directions to try.
+            turn: Number of the search; each number selects other directions.
+        """
         cells = np.flatnonzero(self.problem.may_hold_candidate)
         if len(cells) == 0 or most < 1:
             return

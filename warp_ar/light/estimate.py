@@ -1,23 +1,24 @@
 """Results of the recovery, and their averaging over time.
 
-**Stillness.** While the light is unchanged, the last estimate holds and nothing is solved.
+**Stillness.** While the light is unchanged, the last estimate stays valid and nothing is solved.
 
-**Steadiness.** While the light is unchanged, estimates are averaged, so that noise of single frames does not flicker.
-Estimates of single frames scatter, because noise shifts surfaces, moves points across a threshold, or splits clipped
-cells into other regions. The mean of n estimates of the same light scatters by n^-1/2 of that, and a new estimate moves
-it by 1 / n.
+**Steadiness.** While the light is unchanged, estimates are averaged, so that noise of single frames does not cause
+flicker. Estimates of single frames scatter, because noise shifts surfaces, moves points across a threshold, or splits
+clipped cells into other regions. The mean of n estimates of constant light scatters less by the factor n^-1/2, and a
+new estimate changes it by 1 / n of the difference.
 
-Let m be the relative change of the light since the mean, on surfaces or in the environment. If it is larger, take the
-angle in radians between the current direction and the mean's direction from the ball to the camera instead: seen from
-elsewhere, clipped light lies in other cells, and a mean over both views fits neither. A new estimate has the weight
+Let m be the relative change of the light, on surfaces or in the environment, since the mean; or, if it is larger, the
+angle in radians between the present direction from the ball to the camera and the mean of that direction. Seen from
+another direction, clipped light lies in other cells, and a mean over both views fits neither. A new estimate has the
+weight
 
     w = max((m / still)^2, 1 / n), at most 1.
 
-Light that has changed by ``still`` is followed at once. The lag of a mean has the error m^2, as a variance. Noise alone
-looks like a change by a quarter of ``still``, which thus has little weight. If the light changes by r between
-estimates, the mean lags by m = r / w = (r still^2)^1/3, which is less than ``still``.
+Light that has changed by ``still`` is followed at once. Noise alone looks like a change by a quarter of ``still`` and
+has little weight. If the light changes by r between estimates, the mean lags by m = r / w = (r still^2)^1/3, which is
+less than ``still``.
 
-Emitters that were found, lost or moved are a change of the light: then the mean starts anew.
+If emitters are found, lost or moved, the light has changed, and the mean starts anew.
 """
 
 from __future__ import annotations
@@ -37,15 +38,15 @@ class FoundEmitter:
     """Light source found by its effect on surfaces."""
 
     origin: NDArray[np.float64]
-    """Point of the ball at which the camera sees its reflection, metres, (3,)."""
+    """Point of the ball at which the camera sees the emitter's reflection, metres, (3,)."""
     direction: NDArray[np.float64]
     """Unit direction from ``origin``, (3,)."""
     distance: float
     """Distance from ``origin``, metres; infinite if none was found."""
     power: NDArray[np.float64]
-    """Radiance times solid angle as seen from the ball, per channel, in addition to the map's, (3,)."""
+    """Radiance times solid angle as seen from the ball, per channel, in addition to that in the map, (3,)."""
     cell: int = -1
-    """Index of its cell in the map; -1: none."""
+    """Index of the map's cell that contains the emitter; -1: none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,16 +54,17 @@ class Estimate:
     """Recovered light, as far as one frame determines it."""
 
     recovered: NDArray[np.float32]
-    """Missing radiance of a wholly clipped texel, (rows, columns, 3) of cells."""
+    """Missing radiance of a wholly clipped texel in each cell, (rows, columns, 3)."""
     lower_bound: tuple[bool, bool, bool]
-    """Channels in which the card clips or is not visible: the total is then a lower bound, or depends on priors."""
+    """True for channels in which the card clips or is not visible: the total is a lower bound, or due to priors."""
     emitters: tuple[FoundEmitter, ...] = ()
     """Emitters, the most powerful first."""
     method: str = "clipped"
     """Method used: the requested one or a fallback. ``least``: no card is visible, and clipped light is raised by the
     amount that is missing in nearly every scene."""
     factor: float = 0.0
-    """Share of the method's solution that the evidence allows, 0 to 1; ``recovered`` and ``emitters`` include it."""
+    """Share of the method's solution that the evidence supports, 0 to 1. ``recovered`` and ``emitters`` are multiplied
+    by it."""
     card: CardCheck = NO_CARD
     """Evidence that the card is in the picture."""
     card_share: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -72,12 +74,12 @@ class Estimate:
 
     @property
     def is_finite(self) -> bool:
-        """Return True if all values that it adds to the map are finite."""
+        """True if all values that the estimate adds to the map are finite."""
         powers = all(bool(np.isfinite(emitter.power).all()) for emitter in self.emitters)
         return powers and bool(np.isfinite(self.recovered).all())
 
     def report(self) -> dict[str, Any]:
-        """Return the evidence for the estimate, in the form of reports."""
+        """Return the estimate and the evidence for it, as data for reports (JSON)."""
         emitters = [
             {
                 "direction": [round(float(x), 4) for x in emitter.direction],
@@ -129,11 +131,11 @@ class Seen:
         return cls(environment, shown, told)
 
     def change(self, before: Seen) -> float | None:
-        """Return the relative change of the light since ``before``; None if no surface measures it."""
+        """Return the relative change of the light since ``before``; None if no point is usable in both."""
         both = self.told & before.told
         if not both.any():
             return None
-        # Change of the sum, not sum of the changes: light at the edge of a window alternates between two cells.
+        # The change of the sum is used, because light at the edge of a window alternates between two cells.
         total = max(self.environment.sum(axis=(0, 1)).max(), 1e-9)
         moved = np.abs((self.environment - before.environment).sum(axis=(0, 1))).max() / total
         ratio = np.log(self.shown[both] / before.shown[both])
@@ -141,9 +143,9 @@ class Seen:
 
 
 class Stillness:
-    """Detects whether the light is that of the last estimate.
+    """Detector of light that has not changed since the last estimate.
 
-    While it is, each new estimate waits twice as many turns as the one before.
+    While the light is unchanged, the number of turns until the next estimate about doubles each time.
     """
 
     def __init__(self) -> None:
@@ -152,14 +154,14 @@ class Stillness:
         self._seen: Seen | None = None
 
     def holds(self, cells: NDArray[Any], observations: NDArray[Any], *, settled: bool) -> bool:
-        """Return True if the last estimate still holds, by the change of the light.
+        """Return True if the light has not changed, so that the last estimate stays valid.
 
-        If not, the given light is remembered as that of the next estimate.
+        If it has changed, the given light is stored as that of the next estimate.
 
         Args:
             cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
             observations: Records of ``Observation``, (n,).
-            settled: Whether enough estimates were made for one to be left out.
+            settled: True if enough estimates were made for one to be left out.
         """
         now, before = Seen.of(cells, observations), self._seen
         self._rested += 1
@@ -177,7 +179,7 @@ class Stillness:
 
 
 class Steadiness:
-    """Running mean of estimates, with the light that they were made from."""
+    """Running mean of estimates, and of the observed light from which they were made."""
 
     def __init__(self) -> None:
         """Start without estimates."""
@@ -187,11 +189,11 @@ class Steadiness:
         self._count = 0
 
     def follow(self, estimate: Estimate, seen: Seen, view: NDArray[np.float64]) -> Estimate:
-        """Return the mean including one more estimate.
+        """Add an estimate to the mean, and return the mean.
 
         Args:
-            estimate: Estimate of the frame.
-            seen: Light that the frame showed.
+            estimate: Estimate from a frame.
+            seen: Light that was observed in the frame.
             view: Unit direction from the ball to the camera, (3,).
         """
         weight = self._weight(estimate, seen, view)
@@ -220,7 +222,7 @@ def _powers(estimate: Estimate) -> dict[tuple[int, float], NDArray[np.float64]]:
 
 
 def _mixed_seen(before: Seen, now: Seen, weight: float) -> Seen:
-    """Return the mean of observed light, with ``weight`` for ``now``; a point seen in one only has its value there."""
+    """Return the mean of observed light, with ``weight`` for ``now``; a point usable in only one has that value."""
     shown = np.where(before.told & now.told, before.shown + weight * (now.shown - before.shown), now.shown)
     shown = np.where(before.told & ~now.told, before.shown, shown)
     environment = before.environment + weight * (now.environment - before.environment)
@@ -228,9 +230,10 @@ def _mixed_seen(before: Seen, now: Seen, weight: float) -> Seen:
 
 
 def _mixed(mean: Estimate, now: Estimate, weight: float) -> Estimate:
-    """Return the mean of two estimates' missing radiance, emitter powers and irradiance, with ``weight`` for ``now``.
+    """Return the mean of two estimates, with ``weight`` for ``now``.
 
-    Other fields are those of ``now``, as are cells that miss light in only one of the two.
+    Missing radiance, powers of emitters and irradiance are averaged. Other fields are those of ``now``, and so is the
+    missing radiance of a cell that misses light in only one of the two.
     """
     both = (mean.recovered > 0.0) & (now.recovered > 0.0)
     recovered = np.where(both, mean.recovered + weight * (now.recovered - mean.recovered), now.recovered)

@@ -1,9 +1,9 @@
 """Evidence of the card: whether it is in the picture, how reliable its white is, and bounds on the missing light.
 
-The card's white is the only known reflectance, but a table, a stool or a hand may be where the card is expected. Its
-print identifies it: ink is at most a tenth as bright as the adjacent paper in any light that both receive. White cells
-and ink cells are adjacent all over the print, so the ratio of an ink cell to its nearest white cells does not depend on
-shadows or on the falloff of light.
+The reflectance of the card's paper is the only known one, but something else may be where the card is expected. The
+card's print identifies it: ink is at most a tenth as bright as the adjacent paper in any light. White cells and ink
+cells are adjacent all over the print, so the ratio of an ink cell to its nearest white cells does not depend on shadows
+or on the falloff of light.
 
 Paper is at most thirty times as bright as its ink. A larger ratio shows that the response is steeper than assumed, for
 example S-shaped, and reduces the confidence in the card accordingly.
@@ -33,7 +33,7 @@ class CardCheck:
 
     @property
     def holds(self) -> bool:
-        """Return True if the card is in the picture."""
+        """True if the card is in the picture."""
         config = CONFIG.card
         return self.contrast >= config.least_contrast and self.share >= config.least_share
 
@@ -43,13 +43,13 @@ NO_CARD = CardCheck(0.0, 0.0)
 
 
 def check_card(points: Array, kind: NDArray[np.int64], light: Array) -> CardCheck:
-    """Compare ink with the adjacent paper.
+    """Return the comparison of ink with the adjacent paper.
 
     Args:
         points: Positions of the visible surface points, metres, (n, 3).
         kind: ``Kind`` of each point's surface, (n,).
-        light: pi times the radiance of each point, (n, 3); the clipping level where it clips, which underestimates the
-            contrast of paper to ink.
+        light: pi times the radiance of each point, (n, 3). Clipped points have the clipping level, so that the contrast
+            of paper to ink is underestimated.
     """
     config = CONFIG.card
     paper, ink = np.flatnonzero(kind == Kind.CARD), np.flatnonzero(kind == Kind.INK)
@@ -63,7 +63,7 @@ def check_card(points: Array, kind: NDArray[np.int64], light: Array) -> CardChec
 
 
 def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArray[np.bool_]:
-    """Return the points of paper and ink that something covers, (n,); none if hardly any paper would be left.
+    """Return a mask, (n,), of the points of paper and ink that something covers; empty if hardly any paper is left.
 
     A hand over a part of the card covers paper and adjacent ink, and has the same brightness on both. A shadow darkens
     both, but keeps their ratio.
@@ -71,7 +71,7 @@ def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArra
     Args:
         points: Positions of the visible surface points, metres, (n, 3).
         kind: ``Kind`` of each point's surface, (n,).
-        light: pi times the radiance of each point, (n, 3); the clipping level where it clips.
+        light: pi times the radiance of each point, (n, 3); clipped points have the clipping level.
     """
     config = CONFIG.card
     paper, ink = np.flatnonzero(kind == Kind.CARD), np.flatnonzero(kind == Kind.INK)
@@ -89,7 +89,7 @@ def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArra
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Corrected irradiance at the ball's place for the six axis directions, with its interval."""
+    """Irradiance at the ball's place, recovered light included, for the six axis directions, with its interval."""
 
     normals: Array
     """Surface normals +x, -x, +y, -y, +z, -z, (6, 3)."""
@@ -113,9 +113,9 @@ def irradiance_form(problem: Problem, normals: Array) -> Array:
 
 
 def greyer(contrast: float, white: float) -> float:
-    """Return the factor, at least 1, by which light may exceed the card's estimate because the paper is greyer.
+    """Return the factor, at least 1, by which light may exceed the card's estimate if the paper is greyer than stated.
 
-    The paper's reflectance is estimated as the contrast of paper to ink times the usual reflectance of printed ink.
+    The paper's reflectance is then the contrast of paper to ink times the usual reflectance of printed ink.
 
     Args:
         contrast: Ratio of unclipped paper to adjacent ink.
@@ -135,18 +135,18 @@ def irradiance_interval(
 ) -> Interval:
     """Return the interval of the irradiance at the ball's place.
 
-    Captured irradiance may be too high by ``capture`` and too low by ``overlooked``. An estimate has the spread of its
-    draws; if only a part of it was applied, the whole and as much again may be present. Paper may be greyer than stated
-    (``greyer``). Without draws, or if the card gives only a lower bound, all clipped light may be as bright as
-    ``clipped``.
+    Captured irradiance may be too high by ``capture`` and too low by ``overlooked``. Recovered light has the relative
+    error ``found``; if only a part of it is applied, the upper end includes the rest and as much again. Paper may be
+    greyer than stated (``greyer``). If surfaces do not determine directions, or the card gives only a lower bound, all
+    clipped light may be as bright as ``clipped``.
 
     Args:
         problem: The equations.
         recovered: Solution of the estimate, (cells, 3).
         factor: Share of the solution that is applied, 0 to 1.
-        bounds: Channels in which it is a lower bound.
-        known: Whether surfaces determine the directions of the light.
-        contrast: Paper to ink ratio of the card; 0: no card is visible.
+        bounds: Channels in which the solution is a lower bound.
+        known: True if surfaces determine the directions of the light.
+        contrast: Ratio of the card's paper to its ink; 0: no card is visible.
     """
     config = CONFIG.evidence
     normals = np.array([[s if k == axis else 0.0 for k in range(3)] for axis in range(3) for s in (1.0, -1.0)])
@@ -162,10 +162,11 @@ def irradiance_interval(
 
 
 def most_by_card(problem: Problem, recovered: Array, bounds: tuple[bool, bool, bool], doubt: float) -> float:
-    """Return the factor on a solution, 0 to 1, that limits its share of all light by the share missing at the card.
+    """Return the factor on a solution, 0 to 1, with which its share of all light agrees with the share at the card.
 
     Light from the side or from below hardly reaches the card, and the surfaces that measure it are textured and of
-    unknown reflectance. If little is missing at the card, little is missing elsewhere, within the ratio ``lever``.
+    unknown reflectance. The solution's share of the light from all directions is therefore limited to ``lever`` times
+    the share that is missing at the card.
 
     Args:
         problem: The equations.
@@ -186,7 +187,7 @@ def most_by_card(problem: Problem, recovered: Array, bounds: tuple[bool, bool, b
 
 
 def spread_directions(count: int) -> Array:
-    """Return unit vectors spread evenly over the sphere, (count, 3): a Fibonacci spiral."""
+    """Return unit vectors that are spread evenly over the sphere on a Fibonacci spiral, (count, 3)."""
     k = np.arange(count) + 0.5
     z = 1.0 - 2.0 * k / count
     turn = np.pi * (1.0 + 5.0**0.5) * k

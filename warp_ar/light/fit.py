@@ -1,11 +1,11 @@
 """Solution of the equations: iteratively reweighted least squares with non-negative unknowns.
 
-All channels are solved at once, and for each channel every tried candidate. The first axis of an array is the index of
-the fit; its channel is that index modulo 3. The matrix products of one fit take microseconds, about as long as a call
-of NumPy.
+A fit is the solution for one channel and, in a search, for one tried candidate. All fits are computed at once, because
+the matrix products of one take microseconds, about as long as a call of NumPy. The first axis of an array is the index
+of the fit; its channel is that index modulo 3.
 
-Each deviation is relative to an unknown, a mean or a reflectance. The derivative keeps the dependence on that scale:
-without it, all scales would shrink together, the more so the more parts and equations there are.
+Standard deviations are proportional to unknowns: means and reflectances. The gradient includes the derivative by these
+scales. Without it, all scales would shrink together, the more so the more parts and equations there are.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 @functools.cache
 def _blas() -> ThreadpoolController:
-    """Return the controller of the BLAS libraries; finding them takes as long as four fits."""
+    """Return the controller of the BLAS libraries, which is kept because finding them takes as long as four fits."""
     return ThreadpoolController()
 
 
@@ -37,7 +37,7 @@ _ALONE = threading.Lock()
 
 
 def _renew_lock() -> None:
-    """Replace the lock in a forked process, whose parent may hold it."""
+    """Replace the lock in a forked process, in which no thread would release it if the parent held it."""
     global _ALONE
     _ALONE = threading.Lock()
 
@@ -47,17 +47,17 @@ os.register_at_fork(after_in_child=_renew_lock)
 
 @contextlib.contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit NumPy's BLAS to one thread: products here take microseconds, and waking threads takes longer.
+    """Context in which NumPy's BLAS has one thread: products here take microseconds, and waking threads takes longer.
 
-    The limit belongs to the process, so one solution is computed at a time. The number of threads must not vary:
-    another order of summation would give another picture.
+    The limit applies to the process, so only one thread at a time is in this context. The number of threads is fixed,
+    because another order of summation would give another picture.
     """
     with _ALONE, _blas().limit(limits=1, user_api="blas"):
         yield
 
 
 def solve_nonnegative(hessian: Array, gradient: Array, start: Array | None = None) -> Array:
-    """Minimise x' H x / 2 - g' x over x >= 0, for several problems at once.
+    """Return the x >= 0 that minimises x' H x / 2 - g' x, (problems, n), for several problems at once.
 
     Method: block pivoting. Free unknowns that become negative are fixed at zero; when none does, fixed unknowns with an
         upward gradient are freed.
@@ -85,6 +85,7 @@ def solve_nonnegative(hessian: Array, gradient: Array, start: Array | None = Non
 
 
 LEAST = CONFIG.priors.least
+"""Radiance below which standard deviations of priors are absolute, not relative."""
 
 
 @dataclasses.dataclass
@@ -110,24 +111,28 @@ class _State:
     """Unknowns, with residuals, deviations and cost at them."""
 
     z: Array
+    """Unknowns, (fits, unknowns)."""
     u: Array
     """Reciprocal reflectance of surfaces, (fits, surfaces)."""
     off: Array
+    """Residuals, (fits, rows)."""
     relative: Array
-    """Residuals over their standard deviation, (fits, rows); 0 where a clipped point may be as bright as predicted."""
+    """Residuals divided by their standard deviations, (fits, rows); 0 where a clipped point may be as bright as
+    predicted."""
     deviation: Array
     """Standard deviations of priors, (fits, priors)."""
     strayed: Array
-    """Deviations from priors over their standard deviations, (fits, priors)."""
+    """Deviations from priors divided by their standard deviations, (fits, priors)."""
     cost: Array
+    """Twice the negative log likelihood, (fits,)."""
 
 
 class Equations:
     """Equations and priors of all channels, in a compact form of matrices.
 
-    An equation contains the light of all parts and candidates, and the reciprocal reflectance of one surface. As a full
-    matrix it would be mostly zeros for many surfaces. Only the light and the surface's index are stored, so that the
-    time of products is proportional to the number of equations, not to equations times surfaces.
+    An equation contains the light of all parts and candidates, and the reciprocal reflectance of one surface. A full
+    matrix would consist mostly of zeros if there are many surfaces. Only the light and the surface's index are stored,
+    so that the time of products does not grow with the number of surfaces.
     """
 
     def __init__(
@@ -141,10 +146,11 @@ class Equations:
 
         Args:
             problem: The equations.
-            added: Irradiance per power of candidates, each tried separately besides the problem's own, (3, points, q).
-            centre: Values to which parts and candidates are drawn instead of the means, (3, parts + candidates).
-            known: Reciprocal reflectances from a better known channel, (surfaces,), and the channels in which they
-                apply approximately, (3,).
+            added: Irradiance per unit power of candidates, (3, points, q). Each is tried alone, in addition to the
+                problem's own candidates.
+            centre: Means of the priors on parts and candidates, (3, parts + candidates); None: those of components.
+            known: Reciprocal reflectances in the channel that is measured best, (surfaces,), and a mask, (3,), of the
+                channels to whose priors they apply; None: the usual priors.
         """
         self.problem, self.centre, count = problem, centre, len(problem.kinds)
         card, exact = problem.kind == Kind.CARD, problem.exact.T
@@ -201,11 +207,11 @@ class Equations:
             z[c, self.surface_at + found[told]] = np.maximum(middle[told], 1e-3)
 
     def solve(self, z: Array, iterations: int) -> Fits:
-        """Alternate between computing weights and solving the quadratic problem.
+        """Return the solution, by alternately computing weights and solving a quadratic problem.
 
-        A step is halved while it raises the cost above the least cost so far. Each quadratic problem uses deviations
-        about the last unknowns. Where the card clips, little but the priors on reflectances limits the total light, and
-        full steps may diverge from the least cost.
+        The quadratic problem is valid near the last unknowns only. Where the card clips, hardly anything but the priors
+        on reflectances limits the total light, and full steps may diverge. A step is therefore halved while it raises
+        the cost above the least cost so far.
 
         Args:
             z: Unknowns to start from, (fits, unknowns).
@@ -230,7 +236,7 @@ class Equations:
         return np.asarray((self.light @ z[:, : self.mean_at, None])[..., 0], np.float64)
 
     def _at(self, z: Array) -> _State:
-        """Return residuals, deviations and cost at the given unknowns."""
+        """Return the state at unknowns z, (fits, unknowns)."""
         u, mean = np.maximum(z[:, self.surface_at :], 1e-3), z[:, self.surface_at - 1, None]
         off = self._sum(z) - u[:, self.surface] - self.target
         relative = off / (u[:, self.surface] * self.sigma)
@@ -242,7 +248,13 @@ class Equations:
         return _State(z, u, off, relative, deviation, strayed, cost)
 
     def _deviations(self, z: Array, u: Array, mean: Array) -> Array:
-        """Return the standard deviations of the priors about the given unknowns."""
+        """Return the standard deviations of the priors, (fits, priors), which depend on the unknowns.
+
+        Args:
+            z: Unknowns, (fits, unknowns).
+            u: Reciprocal reflectance of surfaces, (fits, surfaces).
+            mean: Common mean, (fits, 1).
+        """
         problem, priors, parts, mean_at = self.problem, CONFIG.priors, self.problem.parts, self.mean_at
         if self.centre is None:
             about = np.maximum(z[:, mean_at : self.surface_at - 1][:, problem.component], LEAST)
@@ -256,7 +268,7 @@ class Equations:
         return np.concatenate([of_parts, of_candidates, of_means, 3.0 * np.maximum(mean, LEAST), of_ties], axis=1)
 
     def _quadratic(self, state: _State) -> tuple[Array, Array, Array]:
-        """Return Hessian, gradient and weights of the equations about the last estimate."""
+        """Return Hessian, gradient and the equations' weights of the quadratic problem about a state."""
         problem, mean_at, at = self.problem, self.mean_at, self.surface_at
         z, u, places = state.z, state.u, at + self.present
         weights = self.weigh / (1.0 + 0.25 * state.relative**2) / (u[:, self.surface] * self.sigma) ** 2
@@ -264,7 +276,7 @@ class Equations:
         scaled = self.prior.T / state.deviation[:, None] ** 2
         hessian = scaled @ self.prior
         gradient = (scaled @ self.target_prior[..., None])[..., 0]
-        # Log-normal prior on 1 / reflectance, about the last estimate.
+        # The prior on 1 / reflectance is log-normal; it is linearised about the state.
         diagonal = np.arange(at, z.shape[1])
         hessian[:, diagonal, diagonal] += 1.0 / (u * self.spread_u) ** 2
         gradient[:, at:] += np.maximum(1.0 + np.log(self.prior_u / u), 0.2) / (u * self.spread_u**2)
@@ -275,7 +287,7 @@ class Equations:
         hessian[:, :mean_at, places] -= across.transpose(0, 2, 1)
         hessian[:, places, places] += self.by_surface(weights)
         gradient[:, :mean_at] += (self.target[:, None] @ weighted)[:, 0]
-        # Deviations are relative: this gradient keeps their scales from shrinking.
+        # Residuals are relative to reflectance; the first term is the derivative by this scale.
         gradient[:, places] += self.by_surface(weights * (state.off**2 / u[:, self.surface] - self.target))
         if self.centre is None:
             means, mean, strayed = z[:, mean_at : at - 1], z[:, at - 1], state.strayed[:, :at] ** 2
@@ -286,14 +298,14 @@ class Equations:
         return hessian, gradient, weights
 
     def transposed(self, c: int, values: Array) -> Array:
-        """Return the product of a channel's transposed matrix and ``values`` (rows, q), (unknowns, q)."""
+        """Return the product, (unknowns, q), of the transposed matrix of channel c and values (rows, q)."""
         product = np.zeros((self.prior.shape[1], values.shape[1]))
         product[: self.mean_at] = self.light[c].T @ values
         product[self.surface_at + self.present] = -self.by_surface(values[None])[0]
         return product
 
     def by_surface(self, values: Array) -> Array:
-        """Return the sum of the equations' values for each surface that has equations, (fits, surfaces, ...)."""
+        """Return sums of equations' values (fits, rows, ...) for each surface with equations, (fits, surfaces, ...)."""
         return np.add.reduceat(values, self.starts, axis=1) if len(self.starts) else values
 
 
@@ -305,15 +317,15 @@ def fit_channels(
     centre: Array | None = None,
     known: tuple[Array, NDArray[np.bool_]] | None = None,
 ) -> Fits:
-    """Solve the equations of all channels.
+    """Return the solution of the equations of all channels.
 
     Args:
         problem: The equations.
-        z: Unknowns to start from, (fits, unknowns); 0 for a surface without a start value.
+        z: Unknowns to start from, (fits, unknowns); reflectances of 0 are guessed from the light.
         iterations: Number of iterations of reweighting.
-        added: As for `Equations`; each candidate has a fit in each channel.
-        centre: As for `Equations`.
-        known: As for `Equations`.
+        added: Irradiance per unit power of candidates, of which each is tried in a fit per channel, (3, points, q).
+        centre: Means of the priors on parts and candidates, (3, parts + candidates); None: those of components.
+        known: Reciprocal reflectances, and a mask of the channels to whose priors they apply (see `Equations`).
     """
     equations, z = Equations(problem, added, centre, known), z.copy()
     if not z[:, equations.surface_at :].any():

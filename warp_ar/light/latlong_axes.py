@@ -1,6 +1,6 @@
-"""Axes of latlong maps in other programs: names in files, and conversion between them.
+"""Axes of latlong maps in other programs: their names in files, and conversion between them.
 
-``output.environment_axes`` has the table of all axes, and cube maps.
+``output.environment_axes`` documents all axes and converts to cube maps.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ Radiance = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
 
 AXES = LATLONG_AXES
+"""Names of axes."""
 
 DESCRIPTIONS = {
     "z-up": "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward +y",
@@ -27,7 +28,7 @@ DESCRIPTIONS = {
     "y-up": "latlong, row 0 toward +y (up), centre column toward +z, columns grow toward -x",
     "opengl": "latlong, row 0 toward +y (up), centre column toward -z, columns grow toward +x",
 }
-"""Values of the attribute ``axes`` of a latlong."""
+"""Values of the attribute ``axes`` of a latlong file, by the names of axes."""
 
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
@@ -68,9 +69,13 @@ def to_axes(radiance: Radiance, axes: str) -> Radiance:
 
 
 def from_axes(radiance: Radiance, axes: str) -> Radiance:
-    """Return a latlong in other axes converted to this program's; arguments as for `to_axes`.
+    """Return a latlong in other axes converted to this program's.
 
-    If a quarter of the map is a whole number of columns and a half, the map is interpolated by half a texel.
+    If a quarter of the map is not a whole number of columns, the map is interpolated by half a texel.
+
+    Args:
+        radiance: Latlong map in axes ``axes``, (height, width, 3).
+        axes: One of ``AXES``.
 
     Raises:
         UsageError: The axes are unknown, or the number of columns is odd.
@@ -86,10 +91,11 @@ def from_axes(radiance: Radiance, axes: str) -> Radiance:
 
 
 def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error: type[WarpArError], label: str) -> str:
-    """Return the axes of a latlong file; print them if they are assumed.
+    """Return the name of a latlong file's axes, and print them if they are assumed.
 
-    An OpenEXR can state them in its attribute ``axes``. Without it, an OpenEXR has the convention of its format, y-up,
-    with or without ``envmap``. Radiance's format has no convention; its files are read as by Blender and three.js.
+    An OpenEXR can state its axes in the attribute ``axes``. Without this attribute, it has the convention of its
+    format, y-up. The Radiance format has no convention; its files have the axes with which Blender and three.js read
+    them.
 
     Args:
         picture: Content of the file, from `read_linear_picture`.
@@ -99,7 +105,7 @@ def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error
         label: Name of the file in messages.
 
     Raises:
-        WarpArError: As ``error``: the file has the faces of a cube, or its attribute names unknown axes.
+        WarpArError: The file has the faces of a cube, or its attribute names unknown axes; of the class ``error``.
     """
     if picture.header.get("envmap") == OpenEXR.ENVMAP_CUBE:
         raise error(f"{label} holds the faces of a cube; a latlong is needed")
@@ -119,9 +125,10 @@ def axes_of(picture: LinearPicture, path: pathlib.Path, asked: str | None, error
 
 
 def _quarter(radiance: Radiance, axes: str) -> int:
-    """Return the columns to shift a map centred on +x to the right, so that it is centred as ``axes`` need.
+    """Return the number of columns by which a map centred on +x is shifted right to have the centre of other axes.
 
-    ``y-up`` is centred on -y of the marker, a quarter of the map right of +x; ``opengl`` is centred on +y.
+    Maps in axes ``y-up`` are centred on -y of the marker, a quarter of the map to the right of +x; those in ``opengl``
+    on +y.
     """
     if axes == "blender":
         return 0

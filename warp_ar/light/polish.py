@@ -3,17 +3,18 @@
 A matt point has the same radiance from every side. A polished one adds its reflection, which is another part of the
 environment from each side, and scatters less of the light:
 
-    I_k(x) = (1 + e_k) D(x) + g F_k(x) (L_k(x) - D(x)) + h H_k(x),
+    I_k(x) = (1 + e_k) D(x) + g F_k(x) (L_k(x) - D(x)) + h H_k(x)
 
-I_k is the radiance of point x in view k, D the scattered radiance, e_k the drift of the exposure, and F_k L_k the
+Here I_k is the radiance of point x in view k, D the scattered radiance, e_k the drift of the exposure, and F_k L_k the
 environment filtered by a GGX lobe with Fresnel's factor for the reflectance ``USUAL``. H is light that clips in the
-ball, of which only the direction is known; it has a strength h of its own. D is the mean of the point over the views,
-so that texture cannot be taken for a reflection and nothing need be smooth. g is 0 for a matt table and 1 for lacquer.
-It is found by robust least squares for several widths of the lobe. Near its rim the ball's image is less sharp than a
-polished table's, so that the best width is often too small; the next larger one is accepted as possible.
+ball, of which only the direction is known; its strength h is a separate unknown. D is the mean of the point over the
+views. Texture therefore cannot be taken for a reflection, and the table need not be uniform. g is 0 for a matt table
+and 1 for lacquer. g and h are found by robust least squares for several widths of the lobe. Near its rim the ball's
+image is less sharp than a polished table's, so that the best width is often too small; the next larger one is therefore
+accepted as possible.
 
-The environment rotated about the vertical must explain clearly less. Other effects that move with the camera, such as
-the lens's vignetting or objects on the table, do not depend on the true directions of the light.
+To exclude other effects that move with the camera, such as vignetting or objects on the table, the environment rotated
+about the vertical must explain clearly less than the environment itself.
 
 References:
     [DB23] Dupuy, Benyoub 2023, Sampling Visible GGX Normals with Spherical Caps.
@@ -40,37 +41,38 @@ Image = NDArray[np.uint8]
 USUAL: Final = 0.04
 """Reflectance at normal incidence of lacquer, glass and varnish."""
 ROUGHNESS: Final = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45)
-"""Roughnesses to try."""
+"""Roughnesses that are tried."""
 CLIPPED: Final = 245
-"""Code from which a point counts as clipped and is not used."""
+"""8-bit code from which a point counts as clipped and is not used."""
 HOT: Final = 0.77
-"""Camera value at the ball from which light may have been clipped."""
+"""Linear value in the ball's image, 1 at clipping, from which light may have been clipped."""
 VIEWS: Final = 3
-"""Least number of views in which a point must be visible."""
+"""Smallest number of views in which a point must be visible."""
 FEWEST: Final = 150
-"""Least number of usable points."""
+"""Smallest number of usable points."""
 ACROSS: Final = 70
 """Number of points across the examined part of the table."""
 REACH: Final = 0.6
-"""Half width of that part, metres, around the scene's origin."""
+"""Half width of the examined part of the table, metres, around the scene's origin."""
 RAYS: Final = 12
-"""Rays per point and view."""
+"""Number of rays per point and view."""
 TURNS: Final = 7
-"""Number of rotated environments to compare with."""
+"""Number of rotated environments for comparison."""
 ROUNDS: Final = 6
-"""Iterations of reweighting."""
+"""Number of iterations of reweighting."""
 GAIN: Final = 0.06
-"""Least share of the differences between views that must be explained: for matt tables chance explains 0.01."""
+"""Smallest share of the differences between views that must be explained; on matt tables, 0.01 is explained by
+chance."""
 CLEARLY: Final = 1.5
-"""Least ratio of the explained share to that of rotated environments."""
+"""Smallest ratio of the explained share to the largest share that a rotated environment explains."""
 LEAST: Final = 0.3
-"""Least g: no coat reflects less than 0.012."""
+"""Smallest g of a polished table, because no coat reflects less than 0.012."""
 CONTRADICTED: Final = -0.12
-"""Value of h below which clipped light cancels adjacent reflections, so that g is undetermined."""
+"""Value of h below which clipped light would cancel adjacent reflections, so that g is undetermined."""
 FACTOR: Final = 2.0
 """Factor of uncertainty of the reflectance, in both directions."""
 WIDTHS: Final = 0.8
-"""Share of the best explained share from which a roughness is possible."""
+"""Smallest explained share of a possible roughness, relative to that of the best roughness."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +96,7 @@ class _Seen:
     radiance: Array
     """Linear radiance, (k, n, 3)."""
     wo: Array
-    """Direction toward the camera, in the table's own axes, (k, n, 3)."""
+    """Unit direction toward the camera, in the table's frame, (k, n, 3)."""
     tells: NDArray[np.bool_]
     """True where a point is usable in a view, (k, n)."""
 
@@ -107,12 +109,12 @@ class _Seen:
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """Fit of one environment and roughness."""
+    """Fit for one environment and roughness."""
 
     strength: Array
-    """Strength g and, if light clips, h."""
+    """g and, if light clips, h."""
     off: Array
-    """Residual differences, over each point's mean, (k, n, 3)."""
+    """Absolute residuals divided by each point's mean, (k, n, 3)."""
 
 
 def estimate_polish(
@@ -122,17 +124,17 @@ def estimate_polish(
     environment: NDArray[np.float32],
     table: NDArray[np.float32],
 ) -> Polish | None:
-    """Estimate the reflection of the environment in the first plane of a scene.
+    """Return the roughness and reflectance of the first plane of a scene, from reflections of the environment.
 
     Args:
         scene: Scene with a plane, a mirror ball and a card.
         camera: Camera of the pictures, at their size.
         views: RGB pictures (h, w, 3) with ``camera_from_world``: six or more, at least twenty degrees apart.
-        environment: Environment as captured by the ball, without recovered light, camera values, (rows, 2 rows, 3).
-        table: Linear value of each code, (256, 3).
+        environment: Environment as captured by the ball, without recovered light, (rows, 2 rows, 3).
+        table: Linear value of each 8-bit code, (256, 3).
 
     Returns:
-        Result; None if the table is matt, or indistinguishable from a matt one.
+        The result; None if the table is matt, or cannot be distinguished from a matt one.
     """
     plane = next((proxy for proxy in scene.proxies if proxy.shape == "plane" and proxy.material is None), None)
     if plane is None or not scene.probes or len(views) < VIEWS:
@@ -205,20 +207,26 @@ def _observe(
 
 
 def _meets(probe: Probe, points: Array, directions: Array) -> NDArray[np.bool_]:
-    """Return a mask of the rays that pass near a ball; ray i starts at ``points[i]``."""
+    """Return a mask, (n,), of the rays that pass near a ball.
+
+    Args:
+        probe: The ball.
+        points: Origins of the rays, (n, 3).
+        directions: Unit directions of the rays, (n, 3).
+    """
     to = np.asarray(probe.center) - points
     along = (to * directions).sum(1)
     return np.asarray((along > 0.0) & ((to**2).sum(1) - along**2 < (1.6 * probe.radius) ** 2))
 
 
 def _sample(image: NDArray[np.float32], x: NDArray[np.float32], y: NDArray[np.float32]) -> Array:
-    """Return bilinearly interpolated values, (k, channels)."""
+    """Return an image's values at pixels (x, y), (k,) each, by bilinear interpolation, (k, channels)."""
     found = cv2.remap(image, x[:, None], y[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found.reshape(len(x), -1), float)
 
 
 def _look_up(maps: NDArray[np.float32], directions: Array) -> Array:
-    """Return the values of latlong maps in directions (k, 3), (k, channels)."""
+    """Return the values of a latlong map in directions (k, 3) by bilinear interpolation, (k, channels)."""
     rows, columns = maps.shape[:2]
     y = np.clip(np.arccos(np.clip(directions[:, 2], -1.0, 1.0)) / np.pi * rows - 0.5, 0.0, rows - 1.0)
     x = (np.arctan2(directions[:, 1], directions[:, 0]) / np.pi + 1.0) / 2.0 * columns + 0.5
@@ -231,7 +239,16 @@ def _look_up(maps: NDArray[np.float32], directions: Array) -> Array:
 
 
 def _mirror(wo: Array, roughness: float, seed: int) -> tuple[Array, Array]:
-    """Return rays reflected by GGX's visible facets [DB23], (n, RAYS, 3), and weights with Fresnel's, (n, RAYS)."""
+    """Return directions reflected by visible GGX microfacets [DB23], and their weights.
+
+    Args:
+        wo: Unit directions toward the camera, in the table's frame, (n, 3).
+        roughness: Roughness of the table.
+        seed: Seed of the random numbers.
+
+    Returns:
+        Directions, (n, RAYS, 3); and weights, which include Fresnel's factor, (n, RAYS).
+    """
     alpha, shift = roughness**2, np.random.default_rng(seed).random((len(wo), 1, 2))
     steps = np.arange(RAYS)[None]
     turn, height = 2.0 * np.pi * ((steps / RAYS + shift[..., 0]) % 1.0), (steps * 0.6180339887 + shift[..., 1]) % 1.0
@@ -256,7 +273,15 @@ def _masking(cosine: Array, alpha: float) -> Array:
 
 
 def _explain(seen: _Seen, environment: NDArray[np.float32], turn: Array, roughness: float, hot: float) -> _Fit:
-    """Fit the reflection of an environment to the differences between views."""
+    """Return the fit of an environment's reflection to the differences between views.
+
+    Args:
+        seen: Observations.
+        environment: Environment, (rows, 2 rows, 3).
+        turn: Rotation from the table's frame to the world, (3, 3).
+        roughness: Roughness of the table.
+        hot: Radiance from which light may have been clipped.
+    """
     clips = cv2.dilate((environment.max(-1) >= hot).astype(np.float32), np.ones((3, 3)))
     known = np.where(clips[..., None] > 0.0, np.minimum(environment, hot), environment).astype(np.float32)
     rest = np.stack([clips, np.ones_like(clips)], axis=-1)
@@ -273,7 +298,7 @@ def _explain(seen: _Seen, environment: NDArray[np.float32], turn: Array, roughne
 
 
 def _solve(seen: _Seen, terms: list[Array]) -> _Fit:
-    """Fit terms and each view's exposure to the differences between views, by robust least squares."""
+    """Return the robust least-squares fit of terms, (k, n, 3), and of exposures to the differences between views."""
     mean, trust = seen.mean, np.ones_like(seen.radiance)
     drifts = []
     for view in range(1, len(seen.radiance)):
@@ -302,5 +327,5 @@ def _scatter(seen: _Seen, off: Array) -> float:
 
 
 def _cost(seen: _Seen, off: Array, scatter: float) -> float:
-    """Return the mean of squared residuals, each limited to three times the scatter."""
+    """Return the mean of squared residuals, in units of three times the scatter and at most 1 each."""
     return float(np.minimum((off[seen.tells] / (3.0 * scatter)) ** 2, 1.0).mean())

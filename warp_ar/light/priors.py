@@ -1,18 +1,20 @@
 """Priors on clipped light from the captured map alone: its regions, and how far they exceed clipping.
 
+A component is a connected set of clipped cells of the map. Its missing radiance is the part above the clipping level.
+
 **By colour.** Light far brighter than clipping clips in all channels. Light that clips in one channel only is hardly
-brighter than clipping, because its hue would be implausible otherwise. So the expected missing radiance of a component
-is proportional to the square of the share of its clipped solid angle in which all channels clip (``alike``).
+brighter than clipping, because its hue would be implausible otherwise. The expected missing radiance of a component is
+therefore proportional to the square of the share of its clipped solid angle in which all channels clip (``alike``).
 
 **By depth.** A sky that brightens toward the sun clips where it reaches the limit: its missing radiance is zero at that
 boundary and grows inward. A window or a lamp ends at a wall: its missing radiance is constant up to the boundary.
-Unclipped cells next to clipped ones distinguish the two: they are just below clipping, or far below it. So within a
-component missing light is distributed in proportion to the angle from the nearest fading boundary (``depth_profile``),
-up to ``PriorConfig.depth``; without such a boundary it is distributed evenly.
+Unclipped cells next to clipped ones distinguish the two: at a fading boundary they are just below clipping, at a sharp
+one far below it. Within a component, missing light is distributed in proportion to the angle from the nearest fading
+boundary, up to ``PriorConfig.depth`` (``depth_profile``). Without such a boundary it is distributed evenly.
 
-**At least** (``least_missing``). If no surface measures clipped light, it is raised by the amount that is missing in
-nearly every scene. Let X be the irradiance that an estimate adds and D the missing irradiance. The result is no worse
-than the captured map as long as X is at most 2 D. So twice the radiance that is missing nearly everywhere may be added
+**At least** (``least_missing``). If no surface measures clipped light, it is raised by an amount that makes nearly no
+scene worse. Let X be the irradiance that is added and D the missing irradiance. The result is no worse than the
+captured map if X is at most 2 D. Twice the radiance that is missing in nearly every scene may therefore be added
 without further knowledge. This radiance depends on the map:
 
 - **Clipped solid angle.** The larger the clipped solid angle W in steradians, the longer the exposure, and the more
@@ -43,7 +45,10 @@ Array = NDArray[np.float64]
 
 
 def connected_regions(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the connected component of each cell of a latlong mask, across the seam and the poles; -1 for none."""
+    """Return the index of the connected component of each cell of a latlong mask, (rows, columns); -1 for none.
+
+    Cells are also connected across the seam and the poles.
+    """
     height = len(mask)
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     parent = list(range(count))
@@ -70,7 +75,7 @@ def connected_regions(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
 def split_regions(
     labels: NDArray[np.int64], directions: Array, solid_angles: Array, size: float = CONFIG.priors.region
 ) -> tuple[NDArray[np.int64], int]:
-    """Split regions wider than ``size`` steradians into compact parts of about that size.
+    """Split regions larger than ``size`` steradians into compact parts of about that size.
 
     Args:
         labels: Region of each cell, -1 for none, (m,).
@@ -104,14 +109,13 @@ def split_regions(
 
 
 WHOLE = 0.9
-"""Clipped share from which a cell counts as wholly clipped and shows the clipping level."""
+"""Clipped share of a cell above which its radiance is the clipping level."""
 
 
 def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], count: int) -> Array:
-    """Return the expected missing light of each component, relative to a component clipped in all channels, (count,).
+    """Return the expected missing radiance of components, relative to one that clips in all channels, (count,).
 
-    The value is the square of the share of clipped solid angle in which all channels clip, and at least
-    ``least_alike``.
+    It is the square of the share of the clipped solid angle in which all channels clip, but at least ``least_alike``.
 
     Args:
         clipped: Clipped share of cells, per channel, (m, 3).
@@ -128,7 +132,7 @@ def alike(clipped: Array, solid_angle: Array, component: NDArray[np.int64], coun
 
 
 def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
-    """Return the missing radiance of cells relative to their component's mean, by depth inside it, per channel, (m, 3).
+    """Return the missing radiance of cells relative to their component's mean, (m, 3), by their depth in it.
 
     Args:
         cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
@@ -161,7 +165,7 @@ def depth_profile(cells: NDArray[Any], component: NDArray[np.int64]) -> Array:
 
 
 def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a latlong mask with its neighbours added, across the seam."""
+    """Return a latlong mask with adjacent cells added, also across the seam."""
     wide = np.pad(mask, ((0, 0), (1, 1)), mode="wrap").astype(np.uint8)
     return np.asarray(cv2.dilate(wide, np.ones((3, 3), np.uint8))[:, 1:-1] > 0)
 
@@ -169,14 +173,17 @@ def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def least_missing(
     radiance: NDArray[Any], clipped: NDArray[Any], solid_angle: NDArray[Any], is_light: NDArray[np.bool_]
 ) -> Array:
-    """Return the radiance that the prior adds to a wholly clipped texel, (rows, columns, 3).
+    """Return the radiance that is added to a wholly clipped texel of each cell if only the map is known.
 
     Args:
         radiance: Mean radiance of cells of the captured latlong map, (rows, columns, 3).
         clipped: Clipped share of cells, per channel, (rows, columns, 3).
         solid_angle: Solid angles of cells, steradians, (rows, columns).
-        is_light: Cells that were seen and show no modelled surface, (rows, columns): clipped light elsewhere is
-            reflected, or unknown.
+        is_light: Mask, (rows, columns), of the cells that were seen and show no modelled surface. Clipped light in
+            other cells is reflected by a surface, or was not seen.
+
+    Returns:
+        Added radiance, (rows, columns, 3).
     """
     own = np.where(is_light[..., None], clipped, 0.0)
     some = own.max(axis=-1)
@@ -186,7 +193,8 @@ def least_missing(
     found = np.zeros(np.shape(radiance), np.float64)
     if count == 0:
         return found
-    # No cell exceeds clipping, and the brightest cells of a wide clipped area are wholly clipped: they show the level.
+    # No cell exceeds clipping, and the brightest cells of a wide clipped area are wholly clipped. They therefore show
+    # the clipping level.
     level = np.asarray(radiance, np.float64)[inside].max(axis=0)
     area = np.asarray(solid_angle, np.float64)
     wide = min(float((area * some)[inside].sum()), CONFIG.least.most)
@@ -200,10 +208,10 @@ def _sharp(radiance: Array, area: Array, component: NDArray[np.int64], is_light:
     """Return the sharpness of components' boundaries, 0 to 1, (components,); 0.5 if no adjacent cell was seen.
 
     Args:
-        radiance: Radiance of cells over the clipping level, (rows, columns, 3).
+        radiance: Radiance of cells relative to the clipping level, (rows, columns, 3).
         area: Solid angles of cells, steradians, (rows, columns).
         component: Component of each cell, -1 for none, (rows, columns).
-        is_light: Cells to use, as in ``least_missing``, (rows, columns).
+        is_light: Mask, (rows, columns), of the cells that were seen and show no modelled surface.
     """
     below, nearly = CONFIG.priors.fades
     brightness = np.clip(radiance, 0.0, 1.0).mean(axis=-1)

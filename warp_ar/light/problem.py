@@ -1,4 +1,8 @@
-"""Equations of one frame: known and unknown light that each surface point receives."""
+"""Equations of one frame: known and unknown light that each surface point receives.
+
+The module ``recovery`` states the equations and their unknowns. Arrays over cells of the environment map have m rows;
+a part is a region of clipped cells with one unknown radiance.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from warp_ar.light.surfaces import Surfaces, measured_noise, shared_errors
 Array = NDArray[np.float64]
 
 Trace = Callable[[NDArray[np.float32]], Array]
-"""Function from emitters (q, 4: position, radius) of unit intensity to their irradiance at all points, (n, q)."""
+"""Function that returns the irradiance of all points, (n, q), by emitters of intensity 1, (q, 4: position, radius)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +29,9 @@ class Candidate:
     """Candidate for an emitter."""
 
     cell: int
-    """Index of the cell in whose direction it is."""
+    """Index of the cell in whose direction the emitter is."""
     distance: float
-    """Distance in metres from the point where the ball reflects it; infinite: distant."""
+    """Distance in metres from the point where the ball reflects the emitter; infinite for a distant one."""
 
 
 def mirroring_points(directions: Array, center: Array, radius: float, camera: Array | None) -> Array:
@@ -51,8 +55,8 @@ def emitter_directions(cells: NDArray[Any]) -> Array:
 
     A lamp's image in the ball is wider than a cell, and the equations hardly determine which cell contains its centre.
     If nothing else clips within twice ``search.angle``, the direction is the centre of the clipped spot around the
-    cell, found by mean shift. Within a window or a sky, whose centre is not its brightest part, it is the cell's own
-    direction.
+    cell, found by mean shift. Otherwise, as in a window or a sky, whose centre need not be its brightest part, it is
+    the direction of the cell.
     """
     search = CONFIG.search
     direction = cells["direction"].reshape(-1, 3).astype(float)
@@ -114,7 +118,7 @@ class Problem:
         """Pairs of faces of one box, whose reflectances are similar, (pairs, 2)."""
 
     def _read_cells(self, cells: NDArray[Any]) -> Array:
-        """Store the cells of the map; return the share of each cell that clips in any channel, (m,)."""
+        """Store the cells of the map; return the largest share of each cell that clips in a channel, (m,)."""
         self.radiance = cells["radiance"].reshape(-1, 3).astype(float)
         self.lost = cells["clipped"].reshape(-1, 3).astype(float)
         self.missing = cells["missing"].reshape(-1, 3).astype(float)
@@ -122,14 +126,14 @@ class Problem:
         self.solid_angle = cells["solid_angle"].ravel().astype(float)
         self.modelled = cells["modelled"].ravel() > 0.5
         self.hidden = cells["hidden"].ravel().astype(float)
-        # No candidates in unseen cells: shading measures missing light, but hardly its direction.
+        # Unseen cells hold no candidates, because shading measures missing light but hardly its direction.
         seen = self.hidden <= 0.0
         self.may_hold_candidate = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
         return np.asarray(self.lost.max(axis=1) - self.hidden, np.float64)
 
     def _group_cells(self, cells: NDArray[Any], clipped: Array) -> None:
-        """Group clipped cells into parts and components, and compute the expected missing radiance of components."""
-        # Clipped modelled surfaces are kept separate from clipped cells of the environment.
+        """Group clipped cells into components and parts, and compute the expected missing radiance of components."""
+        # Clipped cells that show modelled surfaces are grouped apart from those of the environment.
         beyond = connected_regions(((clipped > LOST) & ~self.modelled).reshape(self.shape)).ravel()
         lit = connected_regions(((clipped > LOST) & self.modelled).reshape(self.shape)).ravel()
         component = np.where(lit >= 0, lit + beyond.max(initial=-1) + 1, beyond)
@@ -144,14 +148,14 @@ class Problem:
         usual *= alike(self.lost, self.solid_angle, component, self.components)
         self.expected = np.where(is_surface, 0.0, usual)
         self.profile = np.ones_like(self.missing)
-        """Factor on ``missing``, (m, 3)."""
+        """Factor on the missing share of each cell, by its depth in its component, (m, 3)."""
         self._depth = depth_profile(cells, component)
         self.is_surface = is_surface[self.component]
         self.member = np.zeros((len(component), self.parts))
         self.member[np.flatnonzero(inside), self.part[inside]] = 1.0
 
     def _read_points(self, observations: NDArray[Any], surfaces: Surfaces, white: float) -> None:
-        """Store the visible points, with their radiance and its reliability."""
+        """Store the visible points, with their radiance and the standard deviation of their equations."""
         seen = observations["visible"] > 0.8
         self.index = np.flatnonzero(seen)
         shown = observations[seen]
@@ -162,7 +166,7 @@ class Problem:
         self.kind = self.kinds[self.surface]
         self.shared = shared_errors(surfaces.overlap, surfaces.kinds[surfaces.surface], seen)
         self.light = np.pi * shown["radiance"].astype(float)
-        # Patches at the edge of clutter, or half in a sharp shadow, are not used.
+        # Points whose surroundings vary are not used; they are at the edge of clutter or of a sharp shadow.
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
         self.exact = (self.light > CONFIG.surfaces.dark) & even & (shown["clipped"] < 0.01)
         self.bound = shown["clipped"] > 0.5
@@ -170,20 +174,20 @@ class Problem:
         self.noise, scatter = measured_noise(points, self.surface, self.kinds, self.light, self.exact)
         told = self.surface[self.exact.all(axis=1) & (self.kind >= Kind.PLANE)]
         self.texture = float(np.median(scatter[told] / self.noise[told])) if len(told) else 1.0
-        """Ratio of the scatter of surfaces other than the card to ``noise``; at least 1."""
+        """Median ratio of surfaces' scatter to ``noise``, without the card; at least 1."""
 
     def leave_out(self, points: NDArray[np.bool_]) -> None:
-        """Exclude points from the equations, (n,), because they show something other than their surface."""
+        """Exclude points, given as a mask (n,), from the equations, because something covers their surface."""
         self.exact[points] = self.bound[points] = False
         self.kind = np.where(points, -1, self.kind)
 
     def _aim_transfer(
         self, cells: NDArray[Any], transfer: NDArray[Any], mirrored: NDArray[Any], surfaces: Surfaces, clipped: Array
     ) -> NDArray[Any]:
-        """Store the transfer from the centres of clipped light; return the part by reflection in balls."""
+        """Store the transfer from cells to visible points, (points, m); return the part by reflection in balls."""
         through_balls = mirrored[self.index]
         self.transfer = transfer[self.index]
-        # Clipped light lies off its cell's centre, for which transfer was traced.
+        # Transfer was traced for the centre of each cell; it is corrected for the direction of clipped light in it.
         emitters = np.flatnonzero((clipped > LOST) & ~self.modelled)
         normals = surfaces.points["normal"][self.index]
         cosine = normals @ cells["middle"].reshape(-1, 3)[emitters].T
@@ -193,8 +197,8 @@ class Problem:
         return through_balls
 
     def _sum_light(self, through_balls: NDArray[Any]) -> None:
-        """Compute captured irradiance, its share by way of balls, and irradiance of each part per unit radiance."""
-        # Clipped light is assumed ten times as bright: only the order of magnitude matters.
+        """Compute captured irradiance, the share that balls reflect, and irradiance of each part per unit radiance."""
+        # Clipped light is assumed to be ten times as bright, because only the order of magnitude matters.
         bright = (self.radiance + 10.0 * self.missing * self.radiance).mean(axis=1)
         sums = self.transfer @ np.column_stack([self.radiance, bright]).astype(np.float32)
         self.captured = sums[:, :3]
@@ -203,9 +207,9 @@ class Problem:
         self._sum_parts()
 
     def share_by_depth(self) -> None:
-        """Distribute missing light by depth from fading boundaries, within parts and around candidates.
+        """Distribute missing light within parts and around candidates by depth from fading boundaries.
 
-        Candidates are searched for before this, because light that is already at an emitter's place would hide it.
+        The search for candidates must precede this, because light that is already at an emitter's place would hide it.
         """
         self.profile = self._depth
         self.missing = self.missing * self.profile
@@ -226,7 +230,10 @@ class Problem:
         self.columns = np.stack(columns)
 
     def card_means(self) -> tuple[Array, tuple[bool, bool, bool]]:
-        """Return the common mean per channel that makes the card correct, and whether it is a lower bound only."""
+        """Return the common mean of missing radiance for which the card's radiance is right, per channel, (3,).
+
+        Also return, per channel, True if it is only a lower bound because the card clips.
+        """
         card = np.flatnonzero(self.kind == Kind.CARD)
         exact = self.exact[card]
         bounds = exact.sum(axis=0) < max(3.0, 0.3 * len(card))
@@ -247,11 +254,12 @@ class Problem:
     def card_factor(self, bounds: tuple[bool, bool, bool], doubt: float) -> float:
         """Return the share, 0 to 1, of the card's correction that is applied.
 
-        The card's irradiance has errors of its white, the response and the ball. The missing part is at least the
-        measured one minus that error, and adding up to twice the missing part is no worse than adding nothing.
+        The measured missing part of the card's irradiance has an error by the card's reflectance, the response and the
+        ball. The true part is at least the measured one minus that error. Adding up to twice the true part is no worse
+        than adding nothing.
 
         Args:
-            bounds: From ``card_means``.
+            bounds: True for channels in which the card clips.
             doubt: Standard deviation of the logarithm of the card's radiance.
         """
         config = CONFIG.evidence
@@ -265,7 +273,7 @@ class Problem:
 
         Args:
             c: Channel.
-            is_bound: Whether the card clips, so that the share is a lower bound.
+            is_bound: True if the card clips, so that the share is a lower bound.
         """
         use = (self.kind == Kind.CARD) & (self.exact[:, c] | (self.bound[:, c] & is_bound))
         if not use.any():
@@ -285,7 +293,11 @@ class Problem:
         return self.first_mean + self.components + 1
 
     def start(self, means: Array) -> Array:
-        """Return start values of the unknowns by the card alone, (3, unknowns); 0 for surfaces."""
+        """Return start values of the unknowns, (3, unknowns), that the card alone implies; 0 for surfaces.
+
+        Args:
+            means: Common mean of missing radiance, per channel, (3,).
+        """
         z = np.zeros((3, self.first_surface + len(self.kinds)))
         z[:, : self.parts] = means[:, None] * self.expected[self.component]
         z[:, self.first_mean : self.first_surface - 1] = means[:, None] * self.expected
@@ -293,7 +305,7 @@ class Problem:
         return z
 
     def power_columns(self, candidates: Sequence[Candidate]) -> Array:
-        """Return irradiance per unit power of candidates, (points, q)."""
+        """Return the irradiance of points per unit power of candidates, (points, q)."""
         cells = np.array([candidate.cell for candidate in candidates])
         distances = np.array([candidate.distance for candidate in candidates])
         columns: Array = np.asarray(self.transfer[:, cells] / self.solid_angle[cells], np.float64)
@@ -316,7 +328,11 @@ class Problem:
         return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
 
     def light_of(self, candidates: Sequence[Candidate]) -> Array:
-        """Return irradiance per unit power of candidates, by channel, (3, points, q)."""
+        """Return the irradiance of points per unit power of candidates, by channel, (3, points, q).
+
+        The power of a distant candidate is distributed over its ``patch``. A near candidate has no power in channels in
+        which nothing clips there.
+        """
         light = np.repeat(self.power_columns(candidates)[None], 3, axis=0)
         for k, candidate in enumerate(candidates):
             patch = self.patch(candidate.cell)
@@ -358,6 +374,10 @@ class Problem:
         ]
 
     def added_irradiance(self, unknowns: Array) -> Array:
-        """Return irradiance of points from parts and candidates, with candidates at their distances, (points, 3)."""
+        """Return the irradiance of points from parts and candidates, (points, 3).
+
+        Args:
+            unknowns: Radiance of parts, then power of candidates, (parts + candidates, 3).
+        """
         columns = np.concatenate([self.columns, self.candidate_columns], axis=2)
         return np.asarray(np.einsum("cnk,kc->nc", columns, unknowns), np.float64)

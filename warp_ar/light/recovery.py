@@ -8,34 +8,33 @@ direction and a distance. A surface k has the unknown reflectance 1 / u_k; the c
 
 **Equations.** A surface point x with the radiance L receives
 
-    pi L(x) u_k = e(x) + sum_r a_r(x) s_r + sum_j b_j(x) p_j,     e = T radiance,  a_r = T clipped over the cells of r,
+    pi L(x) u_k = e(x) + sum_r a_r(x) s_r + sum_j b_j(x) p_j
 
-linear in the non-negative unknowns. Divided by pi L and by the last estimate of u, a residual is a relative error: the
-surface's texture and the error of the transport model. Its size is measured by the scatter of a surface's points
-(``measured_noise``). Clipped points are one-sided: they count only while the prediction is below the clipping level. If
-the whole card clips, the total energy has only a lower bound, which the estimate states. Ink, a twentieth as bright,
-and shadowed surfaces then determine it, as far as the priors on their reflectances allow.
+where e, a_r and b_j are the irradiance at x from the captured map, from region r per unit of missing radiance, and from
+candidate j per unit power. The equations are linear in the non-negative unknowns. Divided by pi L and by the last
+estimate of u, a residual is a relative error: the surface's texture and the error of the transport model. Its size is
+measured by the scatter of a surface's points (``measured_noise``). Clipped points are one-sided: they count only while
+the prediction is below the clipping level. If the whole card clips, it gives only a lower bound on the total light,
+which the estimate states. Ink, which is a twentieth as bright, and shadowed surfaces then determine the total, as far
+as the priors on their reflectances allow.
 
-**Priors** determine directions that surfaces do not measure. The s_r of a region deviates from the mean of its
-connected component, and that mean from a common mean: less if its channels clip separately, and growing inward if its
-boundary fades (``light/priors.py``). The common mean is free. If only the card is used, this mean makes the card's
-radiance correct, which is the method ``white_card``. Clipped pixels of a modelled surface (the card in the ball, a box)
-are reflected light and stay close to clipping. Channels share their distribution: a second pass draws each channel to
-the mean of all three, in the hue of their totals.
+**Priors** determine the light from directions that surfaces do not measure. The s_r of a region deviates from the mean
+of its connected component, and that mean from a common mean. The expected mean is lower if channels clip separately,
+and radiance grows inward if the boundary fades (``light/priors.py``). The common mean is free. If only the card is
+used, this mean makes the card's radiance right, which is the method ``white_card``. Clipped pixels of a modelled
+surface (the card in the ball, a box) are reflected light and stay close to clipping. Channels have similar
+distributions over regions: a second pass draws each channel to the mean of all three, scaled to the channel's total.
 
 **Emitter candidates** are chosen one by one, among all directions that may miss light and a grid of distances, by their
-decrease of the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b). The best few are fitted fully, then
-moved to neighbouring cells and distances while the cost decreases, and kept if the costs of two channels decrease by
-more than ``evidence``. An emitter at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falloff of its
-light determine D. D is measured from the point where the ball reflects the emitter to the camera, up to a radius from
-the ball's centre. A known emitter is moved only for a larger decrease, because emitters do not move.
+decrease of the cost to second order (``light/emitters.py``). The best few are fitted fully, then moved to neighbouring
+cells and distances while the cost decreases, and kept if the costs of two channels decrease by more than ``evidence``.
+An emitter at position p and distance D lights x by cos D^2 / |p - x|^2; its shadows and the falloff of its light
+determine D. D is measured from the point where the ball reflects the emitter to the camera, which is up to a radius
+from the ball's centre. A known emitter is moved only for a larger decrease, because emitters do not move.
 
-Each deviation is relative to an unknown, a mean or a reflectance. The derivative keeps the dependence on that scale:
-without it, all scales would shrink together, the more so the more parts and equations there are.
-
-**Solution.** Iteratively reweighted least squares with Cauchy weights. Each quadratic problem has non-negative unknowns
-and is solved by an active-set method from the last solution. There are about 400 equations and 60 unknowns. Equal input
-gives equal output.
+**Solution.** The equations are solved by iteratively reweighted least squares with Cauchy weights (``light/fit.py``).
+Each quadratic problem has non-negative unknowns and is solved by an active-set method from the last solution. There are
+about 400 equations and 60 unknowns. Equal input gives equal output.
 """
 
 from __future__ import annotations
@@ -60,10 +59,11 @@ from warp_ar.light.surfaces import Surfaces
 Array = NDArray[np.float64]
 
 METHODS: Final = ("clipped", "white_card", "shading")
+"""Methods: clipped light as captured, raised by the card alone, or by the shading of all surfaces."""
 
 
 class Recovery:
-    """Estimates clipped light frame by frame, and keeps the emitters that it finds."""
+    """Estimator of clipped light, frame by frame, which keeps the emitters that it has found."""
 
     def __init__(
         self, surfaces: Surfaces, white: float, center: Sequence[float], *, radius: float = 0.0, method: str = "shading"
@@ -93,9 +93,9 @@ class Recovery:
         self._steadiness = Steadiness()
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
-        """Return True if the last estimate still holds, by the change of the light, so that nothing is solved.
+        """Return True if the light has not changed, so that the last estimate stays valid and nothing is solved.
 
-        If not, the given light is remembered as that of the next estimate.
+        If it has changed, the given light is stored as that of the next estimate.
 
         Args:
             cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
@@ -112,7 +112,7 @@ class Recovery:
         trace: Trace | None = None,
         camera: Array | None = None,
     ) -> Estimate:
-        """Estimate from one frame.
+        """Return the estimate from one frame, averaged with former ones while the light is unchanged.
 
         Args:
             cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
@@ -135,7 +135,7 @@ class Recovery:
         return estimate
 
     def _solve(self, problem: Problem) -> Estimate:
-        """Solve the equations; called by ``update`` on the thread that holds the solver's lock."""
+        """Return the solution of the equations, not averaged; ``update`` calls this while BLAS has one thread."""
         self._frames += 1
         card = check_card(problem.points, problem.kind, problem.light)
         if not card.holds:
@@ -182,10 +182,10 @@ class Recovery:
         return self._held
 
     def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
-        """Return the last estimate while the card is hidden for a short time, else the least missing light.
+        """Return the estimate for a frame without the card: for a short time the last one, then ``least_missing``.
 
         Without a surface of known reflectance, only the shape of shadows measures an emitter's brightness, and texture,
-        gloss and clutter look like shadows.
+        gloss and clutter look like shadows. Other surfaces are therefore not used.
         """
         self._unseen += 1
         if self._held is not None and self._unseen <= CONFIG.card.held:
@@ -199,7 +199,7 @@ class Recovery:
         return self._estimate(problem, least, (True, True, True), "least", float(least.any()), card)
 
     def _search(self, problem: Problem, means: Array) -> None:
-        """Try the candidates of former frames, move one of them, and search for new ones if a search is due."""
+        """Add the candidates of former frames to the problem, move one of them, and at times search for new ones."""
         config = CONFIG.search
         for candidate in self._candidates:
             if problem.may_hold_candidate[candidate.cell]:
@@ -225,7 +225,17 @@ class Recovery:
         card: CardCheck,
         emitters: tuple[FoundEmitter, ...] = (),
     ) -> Estimate:
-        """Return the share ``factor`` of a solution as an estimate, with the interval of the irradiance."""
+        """Return an estimate with the interval of the irradiance.
+
+        Args:
+            problem: The equations.
+            recovered: Missing radiance of cells, (cells, 3).
+            bounds: Channels in which it is a lower bound.
+            method: Method of the solution.
+            factor: Share of the solution that is applied.
+            card: Evidence of the card.
+            emitters: Emitters of the solution.
+        """
         if factor == 0.0:
             method, emitters = "clipped", ()
         emitters = tuple(dataclasses.replace(emitter, power=factor * emitter.power) for emitter in emitters)
@@ -247,12 +257,12 @@ def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[boo
 
     Args:
         problem: The equations, with their candidates chosen.
-        best: Channel that surfaces measure best.
+        best: Channel that most surface points measure.
         means: Common means by the card alone, per channel.
         bounds: Channels in which the card gives a lower bound only.
     """
     bright, start = problem.first_mean, problem.start(means)
-    # In channels without the card, reflectances from a channel with the card are better than their priors.
+    # In channels in which the card clips, reflectances from another channel are better than their priors.
     told = min(range(3), key=lambda c: (bounds[c], c != best))
     known, follows = None, np.array(bounds) & (np.arange(3) != told)
     first = fit_channels(problem, start, CONFIG.solver.iterations).z
@@ -269,7 +279,7 @@ def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[boo
 
 
 def choose_channel(problem: Problem) -> int:
-    """Return the channel that surfaces measure best; green if several are equal.
+    """Return the channel that surfaces measure best: that with most unclipped points; green if several are equal.
 
     Args:
         problem: The equations.

@@ -1,9 +1,9 @@
 """Estimates in a separate process, on CUDA and for pictures that are shown in real time.
 
-A solution takes tens of milliseconds of NumPy products that hold Python's lock. A thread of this process that launches
-kernels or finds markers would wait for the lock at each of its calls. A separate process costs the frames only copies
-of the equations, some 12 MB. It keeps no state between estimates: a solver is sent and returned with its updated state.
-If the process dies, one estimate is lost and computed here instead.
+A solution takes tens of milliseconds of NumPy products, during which other threads of the process, which launch kernels
+and find markers, often wait for the interpreter's lock. With a separate process, frames only have to copy the
+equations, some 12 MB. The process keeps no state between estimates: a solver is sent to it, and returned with its
+updated state. If the process dies, the estimate is computed in this process instead.
 
 The process is not started by ``multiprocessing``, which would run the caller's main module again.
 """
@@ -33,14 +33,14 @@ class Solver(Protocol):
 
 
 class SolvingProcess:
-    """Process that solves for all pipelines of this process, one estimate at a time."""
+    """Separate process that solves for all pipelines of this process, one estimate at a time."""
 
     def __init__(self) -> None:
         """Create the object without starting the process."""
         self._forget()
 
     def _forget(self) -> None:
-        """Drop the process without ending it; also in a fork, because the process belongs to the parent."""
+        """Drop the references to the process without ending it, also in a fork, where the parent owns the process."""
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Any = None
@@ -52,23 +52,23 @@ class SolvingProcess:
             if self._process is not None or self._closed:
                 return
             ours, theirs = multiprocessing.Pipe()
-            # Import paths of this process as absolute paths, independent of the working folder.
+            # The import paths of this process are passed as absolute paths, independent of the working folder.
             paths = [str(Path(__file__).parents[2]), *(os.path.abspath(path) for path in sys.path)]
             code = f"import sys; sys.path[:] = {paths!r}; from {__name__} import serve; serve({theirs.fileno()})"
-            with contextlib.suppress(OSError), theirs:  # if no process can be started, estimates are computed here
+            with contextlib.suppress(OSError), theirs:  # without a process, estimates are computed in this one
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", code],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     env={**os.environ, **dict.fromkeys(_BLAS, "1")},
-                    start_new_session=True,  # without the terminal's interrupts
+                    start_new_session=True,  # the terminal's interrupts do not reach it
                     pass_fds=(theirs.fileno(),),
                 )
             self._connection = ours
 
     @property
     def ready(self) -> bool:
-        """True if the process is ready to solve, or is solving."""
+        """True once the process can solve, also while it is solving."""
         if not self._ready and self._process is not None and self._lock.acquire(blocking=False):
             try:
                 with contextlib.suppress(EOFError, OSError):
@@ -83,12 +83,13 @@ class SolvingProcess:
         return not self.ready and self._process is not None and self._process.poll() is None
 
     def update(self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> tuple[Any, Any]:
-        """Solve in the process if it is ready, otherwise here.
+        """Solve in the separate process if it is ready, otherwise on this thread.
 
         Args:
-            solver: Solver; it is unchanged if the process solves.
-            sides: Cells, transfer, mirrored, observations and the camera's position, as for ``Recovery.update``.
-            trace: Function that traces emitters; called on this thread.
+            solver: Solver; it is unchanged if the separate process solves.
+            sides: Arguments ``cells``, ``transfer``, ``mirrored``, ``observations`` and ``camera`` of
+                ``Recovery.update``.
+            trace: Function that traces emitters; it is called on this thread.
 
         Returns:
             The solver with its updated state, and its solution.
@@ -99,7 +100,7 @@ class SolvingProcess:
     def _ask(
         self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None
     ) -> tuple[Any, Any] | None:
-        """Let the process solve; return its updated solver and its solution, or None if the process has died."""
+        """Have the process solve; return the updated solver and the solution, or None if the process has died."""
         with self._lock:
             try:
                 self._connection.send((solver, sides, trace is not None))
@@ -112,7 +113,7 @@ class SolvingProcess:
                 self._end()
                 return None
             except BaseException:
-                self._end()  # after an error of the trace, the process waits for an answer that will not come
+                self._end()  # after an error in ``trace``, the process would wait for ever for its result
                 raise
         if kind == "error":
             raise value
@@ -126,7 +127,7 @@ class SolvingProcess:
         self._process, self._ready = None, False
 
     def close(self) -> None:
-        """End the process; requested estimates are computed here."""
+        """End the process; later estimates are computed in this one."""
         self._closed = True
         if self._process is not None:
             self._process.kill()  # a thread that waits for it wakes up and releases the lock
@@ -135,13 +136,13 @@ class SolvingProcess:
 
 
 def update(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> Any:
-    """Solve on this thread; ``SolvingProcess.update`` describes the arguments."""
+    """Solve on this thread and return the solution; the arguments are those of ``SolvingProcess.update``."""
     cells, transfer, mirrored, observations, camera = sides
     return solver.update(cells, transfer, mirrored, observations, trace, camera)
 
 
 def serve(descriptor: int) -> None:
-    """Solve the problems that arrive through a pipe, until it is closed; main function of the solving process."""
+    """Solve the problems that arrive through a pipe, until it is closed; this is the main function of the process."""
     import warp_ar.light.recovery  # noqa: F401 - unpickling needs it
 
     connection = Connection(descriptor)

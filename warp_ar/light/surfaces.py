@@ -34,7 +34,7 @@ class Surfaces:
     groups: NDArray[np.int64]
     """Index of the object of each surface, (surfaces,); the faces of a box share it."""
     overlap: NDArray[np.float32]
-    """Degree, 0 to 1, to which two points share their surface's texture, (n, n)."""
+    """Correlation, 0 to 1, of the texture at two points, (n, n)."""
 
 
 class _Collector:
@@ -73,21 +73,22 @@ class _Known(NamedTuple):
 def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     """Return points on all physical surfaces that the scene models: the printed card, planes and boxes.
 
-    On the card: the centres of all cells, and points in its quiet zone. On planes: rings around each ball, where its
-    shadow and reflection fall, and a grid around the origin; outside the card (whose margin is unknown) and outside
-    boxes. On boxes: 5 x 5 points per face. If there are many planes or boxes, only the apparently largest ones, seen
-    from the ball, have points (``SurfaceConfig.planes``, ``boxes``); the others only occlude light.
+    On the card, these are the centres of all cells, and points in its quiet zone (the white margin of the print). On
+    planes, they are rings around each ball, where its shadow and reflection fall, and a grid around the origin, without
+    the card's surroundings and boxes. On boxes, there are up to 5 x 5 points per face. If there are many planes or
+    boxes, only those that look largest from the ball have points (``SurfaceConfig.planes``, ``boxes``); the others only
+    occlude light.
 
     Args:
         scene: Scene with the surfaces.
-        card_only: Whether to return only points of the card's paper and ink.
+        card_only: True to return only points of the card's paper and ink.
     """
     return _find_surfaces(_Known(scene.marker, scene.has_marker, scene.probes, scene.proxies), card_only)
 
 
 @functools.lru_cache(maxsize=4)
 def _find_surfaces(scene: _Known, card_only: bool) -> Surfaces:
-    """Return ``find_surfaces``; an edit of virtual objects finds it in the cache."""
+    """Return the result of ``find_surfaces``, which is cached: edits of virtual objects do not change the arguments."""
     found = _Collector()
     cells, white, side, outline = printed_cells(scene.marker)
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
@@ -114,8 +115,8 @@ def _find_surfaces(scene: _Known, card_only: bool) -> Surfaces:
 
 
 def _largest(scene: _Known, shape: str, most: int) -> set[int]:
-    """Return indices of the ``most`` proxies of a shape that look largest from the first ball."""
-    # A proxy with its own marker moves, so that a point on it is not the same in the next frame.
+    """Return the indices of the static proxies of a shape; if more than ``most``, those largest from the first ball."""
+    # A proxy with a marker of its own may move, so that its points change from frame to frame.
     still = ((number, proxy) for number, proxy in enumerate(scene.proxies) if proxy.marker is None)
     own = [number for number, proxy in still if proxy.shape == shape]
     if len(own) <= most:
@@ -131,7 +132,13 @@ def _largest(scene: _Known, shape: str, most: int) -> set[int]:
 
 
 def _quiet_zone(low: Array, high: Array, side: float) -> Array:
-    """Return points on the paper around the print, half a cell outside it, (32, 3)."""
+    """Return points on the paper around the print, half a cell outside it, (32, 3).
+
+    Args:
+        low: Smallest x and y of the print, metres, (2,).
+        high: Largest x and y of the print, metres, (2,).
+        side: Side of a cell, metres.
+    """
     along = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None]
     corners = np.array([[low[0], high[1]], high, [high[0], low[1]], low]) + 0.5 * side * np.array(
         [[-1, 1], [1, 1], [1, -1], [-1, -1]]
@@ -146,7 +153,7 @@ def _plane_points(scene: _Known, plane: Proxy, low: Array, high: Array) -> Array
     Args:
         scene: Scene with the card and the boxes.
         plane: The plane.
-        low: Least x and y of the marker's print, metres, (2,).
+        low: Smallest x and y of the marker's print, metres, (2,).
         high: Largest x and y of the marker's print, metres, (2,).
     """
     rotation, at = rotation_matrix(plane.rotate), np.array(plane.at)
@@ -195,12 +202,12 @@ def _in_boxes(scene: _Known, points: Array) -> NDArray[np.bool_]:
 def texture_overlap(
     positions: NDArray[Any], surface: NDArray[np.int64], kind: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Return the degree, 0 to 1, to which the texture at two points is correlated, (n, n); 0 without texture.
+    """Return the correlation, 0 to 1, of the texture at two points, (n, n); 0 without texture.
 
     Args:
         positions: Positions of the points, metres, (n, 3).
         surface: Index of each point's surface, (n,).
-        kind: ``Kind`` of that surface, (n,).
+        kind: ``Kind`` of each point's surface, (n,).
     """
     overlap = np.zeros((len(surface), len(surface)), np.float32)
     for number in np.unique(surface):
@@ -215,21 +222,22 @@ def texture_overlap(
 def measured_noise(
     points: NDArray[Any], surface: NDArray[np.int64], kinds: NDArray[np.int64], light: Array, exact: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Return the relative standard deviation of an equation by surface, from its points' scatter about a smooth fit.
+    """Return the relative standard deviation of the equations of each surface, from its points' scatter.
 
-    The fit is a quadratic in the surface's own coordinates, of the logarithm, like the falloff of an emitter's light.
-    So an even box or card has more weight than a textured table, and more than the usual value for boxes and cards.
+    The scatter is that of the logarithm of radiance about a quadratic function of the position on the surface, which
+    approximates the falloff of an emitter's light. An even surface thereby has more weight than a textured one.
 
     Args:
         points: Records of ``SurfacePoint``, (n,).
         surface: Index of each point's surface, (n,).
         kinds: ``Kind`` of each surface, (surfaces,).
         light: pi times the radiance of each point, (n, 3).
-        exact: True where that value is neither clipped nor too dark, (n, 3).
+        exact: True where the radiance is neither clipped nor too dark, (n, 3).
 
     Returns:
-        Standard deviation between ``least_noise`` and the kind's usual value, (surfaces,): cast shadows scatter as
-        well, and they are evidence. And the measured scatter, at least the usual value, (surfaces,).
+        Standard deviation, between ``least_noise`` and ``noise`` of the surface's kind, (surfaces,). It is not larger,
+        because cast shadows increase the scatter although they are evidence. And the scatter, at least ``noise``,
+        (surfaces,).
     """
     noise = np.array(CONFIG.surfaces.noise)[kinds]
     texture = noise.copy()
@@ -256,7 +264,7 @@ def measured_noise(
 
 
 def shared_errors(overlap: NDArray[np.float32], kind: NDArray[np.int64], seen: NDArray[np.bool_]) -> Array:
-    """Return the number of equations that share the error of each visible point.
+    """Return the number of equations that share one error, for each visible point.
 
     Args:
         overlap: Result of ``texture_overlap``, (n, n).
