@@ -12,7 +12,7 @@ from warp_ar.device import resolve_device
 
 
 def _takes_arguments(name: str) -> bool:
-    """Return whether a benchmark has options of its own."""
+    """Return True if a benchmark has options of its own."""
     return "arguments" in inspect.signature(importlib.import_module(f"bench.bench_{name}").main).parameters
 
 

@@ -1,25 +1,30 @@
 """Errors of light and picture for each fault of a simulated camera, alone and all together.
 
-Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual objects really there, with
-which the program's is compared. What clips in the ball of those frames is, before the lens, what the ball mirrors of
-the case's environment, so that a lower exposure shows as much of it as it would; elsewhere it is ``BEYOND``.
-``WARP_AR_FAULT_CASES`` names the cases, all of that folder if it is not set; a case has the version with objects and
-lights where that is rendered, else that with objects alone. ``WARP_AR_FAULTS`` names the faults; ``all_but_NAME`` is
-all of them but one. ``WARP_AR_FAULT_SEEDS`` are those of the noise, over which figures are means: by one alone it is
-partly chance what a codec leaves.
+The camera takes the frames of the rendered cases in ``../shared/truth``, and also the true pictures, in which the
+objects are real. The program's pictures of the frames are compared with the true ones. Where the ball clips in the
+rendered frames, the light before the camera is computed from the case's environment, so that shorter exposures show it
+correctly; other clipped light has the value ``BEYOND``.
 
-``WARP_AR_FAULT_DRAWN`` says whose pictures are compared, several after a comma: ``program`` if it is not set.
+Environment variables, with values separated by commas:
 
-- ``truth`` is the picture with the objects really there through the same camera, but without its noise and codec, which
-  nobody knows beforehand: what is left is not the program's.
-- ``truth_laid`` lays the difference that the objects make in that picture over the camera's frame, which keeps noise
-  and codec of what is really there.
-- ``truth_again`` has noise and codec as well, but the noise of another seed: what matched noise and codec would give.
-- ``faultless`` draws as ``truth`` does, but what this program makes of a faultless camera's frames: what is left to a
-  program that knows all else about the camera. ``faultless_again`` draws that as ``truth_again`` does,
-  ``faultless_bare`` without motion blur and sharpening, which this program does not draw; the desk has them
-  neither there, so that this is at most what they cost.
-- ``clipped`` is the program without recovery of light: beside its error of light, a fault must not invent any.
+- ``WARP_AR_FAULT_CASES``: names of cases; all by default. A case is used in its version with virtual objects and
+  lights if there is one, else in that with objects alone.
+- ``WARP_AR_FAULTS``: names of faults; ``all_but_NAME`` stands for all except one.
+- ``WARP_AR_FAULT_SEEDS``: seeds of the noise. Figures are means over them, because the effect of a codec on one noise
+  is partly chance.
+- ``WARP_AR_FAULT_DRAWN``: pictures to compare with the true ones; ``program`` by default.
+
+Besides ``program``, these pictures give bounds:
+
+- ``truth``: the true picture without the camera's noise and codec, which no program can predict.
+- ``truth_laid``: the camera's frame plus the difference that the objects make in ``truth``. It keeps the frame's noise
+  and codec.
+- ``truth_again``: the true picture with noise of another seed and the codec, as from perfectly matched noise.
+- ``faultless``: the program's result for a faultless camera, through the camera without noise and codec. A program that
+  knows the camera perfectly would have this error. ``faultless_again`` has noise of another seed and the codec.
+  ``faultless_bare`` lacks motion blur and sharpening, which the program does not simulate. They are missing on the desk
+  as well, so the difference is an upper bound on their effect.
+- ``clipped``: the program without recovery of light. A fault must not make recovered light worse than this.
 """
 
 from __future__ import annotations
@@ -46,11 +51,11 @@ from warp_ar.stages.quality import PRESETS, Quality
 TRUTH = Path(__file__).resolve().parents[2] / "shared" / "truth"
 QUALITY = "medium"
 BEYOND = 4.0
-"""Linear value of what clips, unless it is known."""
+"""Linear value of clipped light, where it is unknown."""
 ANOTHER = 1000
-"""From a seed of the noise to the seed of noise that is like it."""
+"""Difference of seeds between the camera's noise and other noise of the same kind."""
 WITHIN = (np.arange(4) + 0.5) / 4 - 0.5
-"""Places within a pixel, along either side, at which it is looked up what the ball mirrors."""
+"""Offsets within a pixel, in each direction, of the rays by which the ball's reflection is computed."""
 
 
 def read(path: Path) -> Any:
@@ -58,16 +63,16 @@ def read(path: Path) -> Any:
 
 
 def light_of(path: Path, mirrored: Any = None) -> Any:
-    """Linear values of a frame before the camera, what clips by ``mirrored`` where that is a number."""
+    """Return the linear values of a rendered frame, with clipped light from ``mirrored`` where that is not NaN."""
     codes = read(path)
     beyond = BEYOND if mirrored is None else np.where(np.isnan(mirrored), BEYOND, np.maximum(mirrored, 1.0))
     return np.where(codes >= 254, beyond, decode_srgb(codes))
 
 
 def mirrored_light(case: Path, frame: int) -> Any:
-    """What the ball mirrors of the environment, linear; NaN beside the ball.
+    """Return the linear light of the environment that the ball reflects, (height, width, 3); NaN outside the ball.
 
-    Where a frame of a quarter of the exposure does not clip (``dark_25``), this is within 1 % of it in the median.
+    Where a frame with a quarter of the exposure (``dark_25``) does not clip, its median difference to this is 1 %.
     """
     about = json.loads((case / "case.json").read_text())
     known = [int(path.stem) for path in (case / "env").glob("*.npy")]
@@ -109,20 +114,24 @@ def flip(truth: Any, picture: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Clip:
-    """A case before the camera: linear frames (height, width, 3) without the virtual objects and with them."""
+    """Case before the camera: linear frames, (height, width, 3), without and with the objects."""
 
     case: Path
+    """Folder of the case."""
     version: str
+    """Version of the case: ``both`` or ``object``."""
     names: tuple[str, ...]
+    """File names of the frames."""
     truths: frozenset[str]
-    """Names of the frames that are known with the objects there."""
+    """Names of the frames that have a true picture."""
     clean: tuple[Any, ...]
+    """Frames without the objects."""
     there: tuple[Any, ...]
-    """As ``clean`` where the objects are not known."""
+    """Frames with the objects, or without them where there is no true picture."""
 
     @property
     def phase(self) -> Any:
-        """Where in the clip each frame lies, 0 to 1."""
+        """Position of each frame in the clip, 0 to 1."""
         return np.linspace(0.0, 1.0, len(self.names))
 
 
@@ -139,11 +148,11 @@ def read_clip(case: Path, version: str) -> Clip:
 def program_results(
     clip: Clip, faults: Faults, frames: list[Any], device: str, quality: str | Quality = QUALITY
 ) -> list[Any]:
-    """What the program makes of a camera's ``frames``."""
+    """Return the program's results for the frames of a camera."""
     scene = load_scene(clip.case / f"scene_{clip.version}.toml")
     scene = dataclasses.replace(scene, source=SourceSpec(path=clip.case / "camera", metering="automatic"))
     if faults.distortion:
-        # The calibration knows the lens: its focal length here is the picture's width.
+        # The scene knows the lens. The camera's distortion refers to a focal length of the picture's width.
         scale = (scene.camera.fx / scene.camera.width) ** 2
         known = (faults.distortion * scale, 0.0, 0.0, 0.0, 0.0)
         scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, distortion=known))
@@ -156,7 +165,7 @@ def program_results(
 
 @functools.lru_cache(maxsize=1)
 def faultless_light(clip: Clip, device: str) -> list[Any]:
-    """Linear values of what the program draws of a faultless camera's frames; what clips as in the truth."""
+    """Return the linear values of the program's pictures for a faultless camera; clipped light is that of the truth."""
     results = program_results(clip, Faults(), expose(clip.clean, Faults()), device)
     pictures = [np.asarray(result.image) for result in results]
     return [
@@ -165,7 +174,7 @@ def faultless_light(clip: Clip, device: str) -> list[Any]:
 
 
 def drawn_pictures(clip: Clip, faults: Faults, frames: list[Any], drawn: str, device: str) -> list[Any]:
-    """The truth or the faultless camera's result through a camera with ``faults``, as the module says."""
+    """Return the pictures ``drawn``, other than the program's, for a camera with faults (see the module)."""
     light = faultless_light(clip, device) if drawn.startswith("faultless") else clip.there
     if drawn.endswith("_again"):
         return list(expose(light, dataclasses.replace(faults, seed=faults.seed + ANOTHER), phase=clip.phase))
@@ -183,11 +192,14 @@ def drawn_pictures(clip: Clip, faults: Faults, frames: list[Any], drawn: str, de
 
 
 def errors_of_results(clip: Clip, faults: Faults, results: list[Any]) -> dict[str, float]:
-    """Errors of light and pose: means over frames."""
+    """Return the mean errors of light and pose over frames.
+
+    ``light`` is relative; ``posed`` is the share of frames with a pose.
+    """
     light, angles, shifts = [], [], []
     poses = json.loads((clip.case / "case.json").read_text())["poses"]
     for index, (name, result) in enumerate(zip(clip.names, results, strict=False)):
-        # A camera that ends at a code below 255 has that code's value where the light is 1.
+        # A camera whose highest code is below 255 shows light of 1 as that code.
         gain = decode_srgb(np.array(faults.saturation))
         gain = gain * (1.0 + faults.exposure_drift * np.sin(2 * np.pi * clip.phase[index]))
         tint = 1.0 + faults.white_balance_drift * np.array([1, 0, -1]) * clip.phase[index]
@@ -208,9 +220,9 @@ def errors_of_results(clip: Clip, faults: Faults, results: list[Any]) -> dict[st
 
 
 def score(clip: Clip, faults: Faults, drawn: str, device: str) -> dict[str, float]:
-    """Share of the picture's error that is kept and that error itself; of the program, errors of light and pose too."""
+    """Return the picture's error, FLIP, and its ratio to that without objects; for the program also light and pose."""
     frames = expose(clip.clean, faults)
-    # The same clip with the objects there, so that its noise, codec and drift are the same camera's.
+    # The true pictures pass through an equal camera, with its noise, codec and drift.
     wanted = expose(clip.there, faults, phase=clip.phase)
     if drawn in ("program", "clipped"):
         quality = PRESETS[QUALITY].with_methods(recover="clipped") if drawn == "clipped" else QUALITY
@@ -241,7 +253,7 @@ def main(device: str) -> None:
     for case, fault, whose in itertools.product(cases, chosen, drawn):
         faults = faults_named(fault)
         version = "both" if (TRUTH / case / "both").is_dir() else "object"
-        # Noise alone has a seed; a fault without any gives the same figures with each.
+        # Only noise depends on the seed; other faults give equal figures with each.
         runs = [
             score(read_clip(TRUTH / case, version), dataclasses.replace(faults, seed=seed), whose, device)
             for seed in (seeds if faults.noise else seeds[:1])

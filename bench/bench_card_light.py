@@ -1,8 +1,8 @@
-"""Error of the irradiance that card, planes and boxes tell of, with the mirror ball painted out of rendered desks.
+"""Error of the irradiance estimated from card, planes and boxes, on rendered desks without the mirror ball.
 
-Beside it that of a constant light of the card's brightness, and that of the ball itself by the preset ``medium``: all
-over all directions, relative to the true light at the ball, as ``truth_score`` has it. The ball is painted over by the
-median of the desk around it.
+The ball is painted over with the median of the desk around it. For comparison, there is the error of constant light
+with the card's brightness, and that of the preset ``medium`` with the ball. Errors are relative to the true irradiance
+at the ball's place, over all directions.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.pixel_rays import project
 
 FRAMES = (0, 5, 11)
+"""Indices of the measured frames."""
 
 
 def painted(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> npt.NDArray[np.uint8]:
-    """The frame without its first ball."""
+    """Return a frame in which the first ball is painted over."""
     ball, camera = scene.probes[0], scene.camera
     center = pose.apply(np.array(ball.center))
     u, v = project(camera, center[None])[0]
@@ -42,7 +43,7 @@ def painted(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> npt.NDArr
 
 
 def card_irradiance(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> npt.NDArray[np.float64]:
-    """By the median of the card's white alone, RGB."""
+    """Return the irradiance by the median of the card's paper alone, RGB."""
     surfaces = find_surfaces(scene)
     points = surfaces.points["position"][surfaces.kinds[surfaces.surface] == Kind.CARD].astype(np.float64)
     columns, rows = project(scene.camera, pose.apply(points)).round().astype(int).T
@@ -51,7 +52,7 @@ def card_irradiance(image: npt.NDArray[np.uint8], scene: Scene, pose: Pose) -> n
 
 
 def main(device: str) -> None:
-    """Print the three errors of each desk, in the mean of its frames and, for the card, of the worst frame."""
+    """Print the three mean errors of each desk, and the largest ratio of the card's error to that of constant light."""
     theta, phi = (np.arange(64) + 0.5) / 64 * np.pi, ((np.arange(128) + 0.5) / 64 - 1.0) * np.pi
     rows, columns = np.meshgrid(theta, phi, indexing="ij")
     sine = np.sin(rows)

@@ -1,13 +1,18 @@
-"""How far one number, the same for all pictures, makes up for light that clips, over a folder of environments.
+"""Error of irradiance with clipped light, and with clipped light raised by one number, over a folder of environments.
 
     python -m bench clipping_prior --folder=FOLDER    # FOLDER/*.hdr: latlong, unclipped
 
-Each map is exposed as a camera would that looks at its horizon, a little down, and meters its frame's mean to 18 %, and
-up to some stops beside that; it is clipped there. What clips then gets so many times the level of clipping more. Errors
-are relative, of irradiance over directions and channels: as clipped, with each number, with the best number of each
-picture, as the program raises it where nothing else tells (``least``; ``light/least_missing.py``), and clipped that
-many stops later, as a second, shorter photograph would. ``allowed`` are quantiles of what ``LeastConfig.least`` may be
-for an exposure not to become worse. One JSON line.
+Each map is clipped as by a camera that looks slightly below its horizon and meters the mean of its frame to 18 %, with
+an offset of some stops. Errors are relative, of irradiance over directions and channels, for:
+
+- ``clipped``: the clipped map;
+- each of ``NUMBERS``: radiance added where the map clips, in units of the clipping level;
+- ``best``: the number that is best for each picture;
+- ``least``: the program's prior without any other evidence (``priors.least_missing``);
+- ``stops_N``: a map that clips N stops later, as in a second, shorter photograph.
+
+``allowed`` are quantiles of the largest ``LeastConfig.least`` with which an exposure does not become worse. The result
+is one JSON line.
 """
 
 from __future__ import annotations
@@ -33,38 +38,38 @@ from warp_ar.light.priors import least_missing
 Map = NDArray[np.float32]
 
 NUMBERS: Final = (0.5, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0)
-"""Times the level of clipping that a wholly clipped texel gets more."""
+"""Radiance added to a wholly clipped texel, in units of the clipping level."""
 SHORTER: Final = (2, 4, 6)
-"""Stops by which a second photograph is shorter."""
+"""Numbers of stops by which a second photograph is shorter."""
 GREY: Final = 0.18
-"""Share of the level of clipping that metering puts a frame's mean at."""
+"""Mean radiance of a metered frame, relative to the clipping level."""
 FRAME: Final = (45.0, 60.0)
-"""Degrees of the frame, high and wide; its upper edge is 10 degrees above the horizon."""
+"""Height and width of the frame in degrees; its upper edge is 10 degrees above the horizon."""
 WORSE: Final = 1.02
-"""Ratio of errors from which on a number made a picture worse."""
+"""Ratio of errors above which a picture counts as worse."""
 
 
 @functools.cache
 def _form() -> NDArray[np.float32]:
-    """Irradiance of directions by radiance of a map of 64 rows, (64, 8192)."""
+    """Return the matrix from the radiance of a map of 64 rows to irradiance in 64 directions, (64, 8192)."""
     d, area = latlong_directions(64, 128)
     cosine = np.maximum(spread_directions(64) @ d.reshape(-1, 3).T, 0.0)
     return np.asarray(cosine * area.reshape(-1), np.float32)
 
 
 def irradiance(radiance: Map) -> NDArray[np.float64]:
-    """Of a latlong map (h, 2 h, 3), in 64 directions, (64, 3)."""
+    """Return the irradiance of a latlong map (h, 2 h, 3) in 64 directions, (64, 3)."""
     small = cv2.resize(radiance, (128, 64), interpolation=cv2.INTER_AREA)
     return np.asarray(_form() @ small.reshape(-1, 3), np.float64)
 
 
 def metered_level(radiance: Map, column: int, stops: float) -> float:
-    """Radiance at which a camera clips that meters a frame of a latlong map.
+    """Return the radiance at which a camera clips that meters a frame of a latlong map.
 
     Args:
-        radiance: (h, 2 h, 3).
+        radiance: Latlong map, (h, 2 h, 3).
         column: Left edge of the frame.
-        stops: By which it exposes less than metered.
+        stops: Number of stops by which the exposure is shorter than metered.
     """
     rows, columns = radiance.shape[:2]
     top, bottom = (round(rows * (90.0 + angle) / 180.0) for angle in (-10.0, FRAME[0] - 10.0))
@@ -73,11 +78,11 @@ def metered_level(radiance: Map, column: int, stops: float) -> float:
 
 
 def raise_clipped(radiance: Map, clipped: NDArray[np.bool_]) -> Map:
-    """A map with what clips raised by what nearly every place lacks.
+    """Return a clipped map in which clipped light is raised by ``least_missing``.
 
     Args:
-        radiance: As clipped, (h, 2 h, 3).
-        clipped: Where channels clip, of the same shape.
+        radiance: Clipped map, (h, 2 h, 3).
+        clipped: Mask of clipped channels, (h, 2 h, 3).
     """
     share = clipped.astype(np.float32)
     cells = [cv2.resize(one, (CELL_COLUMNS, CELL_ROWS), interpolation=cv2.INTER_AREA) for one in (radiance, share)]
@@ -88,15 +93,15 @@ def raise_clipped(radiance: Map, clipped: NDArray[np.bool_]) -> Map:
 
 
 def errors_of(radiance: Map, level: float) -> dict[str, float]:
-    """Relative errors of irradiance of one exposure of a map, by what was done with what clips.
+    """Return the relative errors of irradiance for one exposure of a map.
 
     Args:
-        radiance: (h, 2 h, 3).
+        radiance: Latlong map, (h, 2 h, 3).
         level: Radiance at which all channels clip.
 
     Returns:
-        ``clipped``; by each number, as text; ``best``; ``least``; ``stops_N``; ``allowed``, what ``LeastConfig.least``
-        may be; and ``missing``, the mean radiance, over the level, that what clips lacks by all directions' irradiance.
+        Errors by the names that the module lists; ``allowed``, the largest allowed ``LeastConfig.least``; and
+        ``missing``, the mean missing radiance of clipped light in units of the level, by the missing irradiance.
     """
     truth, clipped = irradiance(radiance), irradiance(np.minimum(radiance, level))
     unit = irradiance((radiance >= level).astype(np.float32) * np.float32(level))
@@ -117,7 +122,7 @@ def errors_of(radiance: Map, level: float) -> dict[str, float]:
 
 
 def summarise(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Means over exposures, and in what share of them each number made the picture worse."""
+    """Return mean errors over exposures, the share of them that each number makes worse, and quantiles."""
     others = ("missing", "allowed")
     means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0] if key not in others}
     worse = {
@@ -136,7 +141,7 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def main(device: str, arguments: Sequence[str] = ()) -> None:
-    """Measure all maps of a folder; nothing runs on the device."""
+    """Measure all maps of a folder and print one JSON line; nothing runs on the device."""
     parser = argparse.ArgumentParser(prog="python -m bench clipping_prior", description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, help="a folder of latlong .hdr files")
     parser.add_argument("--stops", type=float, default=1.0, help="largest offset to metering, to either side")

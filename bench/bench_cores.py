@@ -1,14 +1,13 @@
-"""Whole frames on 1, 2, 4, ... cores of one machine: milliseconds and processor time, in turn, and a table of both.
+"""Time of whole frames on 1, 2, 4, ... cores of one machine: elapsed time and processor time.
 
-Each run is a process of its own that may use so many cores, as ``taskset`` would have it. ``WARP_AR_BENCH`` may name a
-height of frames (480 or 1080) and how often all counts are run in turn, as in ``1080,3``; 480 and 2 are usual. Settled
-frames are measured: the clip goes round, as a stream's does.
+Each run is a process that is restricted to a number of cores. All numbers are run in turn, several times.
+``WARP_AR_BENCH`` may state the height of frames (480 or 1080) and the number of turns, as in ``1080,3``; the default is
+``480,2``. The clip is repeated without a break, and the first frames are not measured.
 
-A second table has where the time of a frame goes at each count: the thread that looks for the marker; the thread that
-renders, in Python and in the native threads' work; and each stage, by the time of all threads. ``whole`` is what a
-stage does in passes that cannot be split. ``path`` is the longest chain of stages that wait for each other if there
-were cores without end, each pass then taking its time as a whole or that of the shortest piece that is worth taking:
-no count of cores brings a frame below it.
+A second table divides the time of a frame for each number of cores: tracking; rendering, in Python and in native
+threads; and each stage, summed over all threads. ``whole`` is the time of passes that cannot be split into bands.
+``path`` is a lower bound on the time with any number of cores: the longest chain of stages that wait for each other,
+where a pass takes its whole time if it cannot be split, else that of the smallest piece.
 """
 
 from __future__ import annotations
@@ -32,15 +31,17 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import bands
 
 WARM_UP = 12
+"""Number of frames before the measured ones."""
 FRAMES = 60
+"""Number of measured frames."""
 _LABELS = {"480": "480p", "1080": "1080p"}
 
 
 class Watch:
-    """Where the time of a pipeline's frames goes, in milliseconds."""
+    """Times of the parts of a pipeline's frames, in milliseconds."""
 
     def __init__(self, pipeline: Pipeline) -> None:
-        """Measure what a pipeline does from now on."""
+        """Begin to measure a pipeline."""
         self.parts: dict[str, list[float]] = collections.defaultdict(list)
         self.stages: dict[str, list[float]] = collections.defaultdict(list)
         pipeline.warm_up()
@@ -79,12 +80,12 @@ class Watch:
         threads.run = followed  # type: ignore[method-assign]
 
     def forget(self) -> None:
-        """Leave out the frames so far."""
+        """Discard the times of the frames so far."""
         self.parts.clear()
         self.stages.clear()
 
     def means(self) -> dict[str, dict[str, float]]:
-        """Means over frames."""
+        """Return the mean times over frames, of parts and of stages."""
         parts = {name: statistics.mean(values) for name, values in self.parts.items()}
         parts["python"] = parts["render"] - parts.get("native", 0.0)
         stages = {name: round(statistics.mean(values), 3) for name, values in self.stages.items()}
@@ -92,7 +93,7 @@ class Watch:
 
 
 def least_times(threads: CpuThreads) -> tuple[float, float]:
-    """Milliseconds of the last frame in passes that cannot be split, and of its path with cores without end."""
+    """Return the last frame's ``whole`` and ``path``, which the module defines, in milliseconds."""
     table, stages = threads._passes, threads._stages
     spent = table[:, bands.PASS.index("time")] * 1e-6
     whole = table[:, bands.PASS.index("whole")] == 1
@@ -101,7 +102,7 @@ def least_times(threads: CpuThreads) -> tuple[float, float]:
         stages[:, bands.STAGE.index(name)] for name in ("first_pass", "last_pass", "first_reader", "last_reader")
     )
     begun = np.zeros(len(stages))
-    for stage in range(len(stages)):  # in an order in which they may run
+    for stage in range(len(stages)):  # every stage comes after those that it waits for
         done = begun[stage] + least[first[stage] : last[stage]].sum()
         for other in threads._readers[reader[stage] : readers_end[stage]]:
             begun[other] = max(begun[other], done)
@@ -110,7 +111,7 @@ def least_times(threads: CpuThreads) -> tuple[float, float]:
 
 
 def run_frames(size: str) -> dict[str, Any]:
-    """Of settled frames of ``desk`` at ``medium``: by the clock, tracking included, of all threads, and its parts."""
+    """Return median elapsed time (with tracking), mean processor time and parts of frames of ``desk`` at ``medium``."""
     frames = clip("desk", SIZES[size])
     wall, spent = [], []
     with Pipeline(frames.scene, device="cpu") as pipeline:
@@ -125,7 +126,7 @@ def run_frames(size: str) -> dict[str, Any]:
 
 
 def print_parts(runs: dict[int, list[dict[str, Any]]]) -> None:
-    """The second table: a line for each part of a frame, a column for each count of cores."""
+    """Print the second table: a line for each part of a frame, a column for each number of cores."""
 
     def means(kind: str, name: str) -> list[float]:
         return [round(float(np.mean([run[kind].get(name, 0.0) for run in found])), 3) for found in runs.values()]
@@ -152,7 +153,7 @@ def print_parts(runs: dict[int, list[dict[str, Any]]]) -> None:
 
 
 def main(device: str) -> None:
-    """The table; on CPU only."""
+    """Run all numbers of cores in turn and print both tables; only the CPU is measured."""
     del device
     asked = [part for part in os.environ.get("WARP_AR_BENCH", "").split(",") if part]
     size = _LABELS[asked[0]] if asked else "480p"
@@ -160,7 +161,7 @@ def main(device: str) -> None:
     own = sorted(os.sched_getaffinity(0))
     counts = [count for count in (1, 2, 4, 8, 16, 32, 64) if count <= len(own)]
     runs: dict[int, list[dict[str, Any]]] = {count: [] for count in counts}
-    run_frames(size)  # compiles what is missing
+    run_frames(size)  # compiles kernels that are not in the cache
     for _ in range(turns):
         for count in counts:
             cores = ",".join(map(str, own[:count]))

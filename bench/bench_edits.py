@@ -1,6 +1,7 @@
-"""Time until the next frame can begin after an object is moved, painted, added or removed, beside that of a frame.
+"""Time from an edit of an object (move, paint, add, remove) until the next frame can begin, and time of a frame.
 
-Modules in the kernel cache are counted, too. With an empty ``WARP_CACHE_PATH`` that is every module compiled so far.
+The modules in the kernel cache are counted as well. If the folder ``WARP_CACHE_PATH`` was empty at the start, these are
+the modules compiled so far.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from warp_ar.scene import MetallicRoughnessMaterial, load_scene
 from warp_ar.sources.sources import open_scene_source
 
 ROUNDS = 12
+"""Number of measured rounds of all edits."""
 
 
 def main(device: str) -> None:
-    """Print the median of each; every round is one of all, so that they meet the same load."""
+    """Print the median of each edit; every round contains all edits, so that all are measured under equal load."""
     scene = load_scene("desk")
     with open_scene_source(scene, None, loop=False) as source, Pipeline(scene, device=device) as pipeline:
         frames = itertools.cycle([frame.image for frame in itertools.islice(source, 4)])

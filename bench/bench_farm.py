@@ -1,8 +1,8 @@
-"""The farm from file to file: frames a second by number of workers, or in turn with another checkout.
+"""Speed of the farm, from file to file, for numbers of workers, or in comparison with another checkout.
 
 ``python -m bench farm --device cpu --workers 1,2`` lights the bundled desk in segments and checks that the joined
-recordings are the same bytes. ``--other DIR`` runs the same job file by the program of another checkout in turn, and
-prints the median of the paired ratios of frames a second.
+recordings have equal bytes. With ``--other DIR``, the program of another checkout runs the job file in turn with this
+one; the median of the paired ratios of frames per second is printed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,15 @@ scene = "desk"
 
 
 def light(root: Path, jobs: Path, folder: Path, device: str, workers: str) -> tuple[float, str]:
-    """Run the farm of a checkout; return frames a second of the whole run, and the recording's digest."""
+    """Run the farm of a checkout; return the frames per second of the whole run, and the recording's digest.
+
+    Args:
+        root: Folder of the checkout.
+        jobs: The job file.
+        folder: Folder of the run.
+        device: Option ``--device`` of the farm.
+        workers: Number of workers as text, or ``default``.
+    """
     command = [sys.executable, "-m", "warp_ar.farm", "run", str(jobs), "--output", str(folder), "--device", device]
     if workers != "default":
         command += ["--workers", workers]
@@ -59,7 +67,7 @@ def main(device: str, arguments: Sequence[str] = ()) -> None:
         digests = set()
         for workers in options.workers.split(","):
             rates: list[list[float]] = [[] for _ in roots]
-            for turn in range(-1, options.turns):  # the first one compiles kernels
+            for turn in range(-1, options.turns):  # the first turn compiles kernels and is not counted
                 for number, root in enumerate(roots):
                     rate, digest = light(root, jobs, Path(name) / f"{workers}-{number}-{turn}", device, workers)
                     digests.add(digest)

@@ -1,10 +1,11 @@
-"""How far a virtual object's pixels move from frame to frame while the camera and all that it sees stand still.
+"""Flicker of a virtual object while the camera and everything in its view stand still.
 
-The first frame of each case of ``../shared/truth`` is taken 30 times through a camera with noise, and with noise and
-H.264. Each picture's object (no virtual light: the desk it falls on has the camera's noise) is averaged over 9 by 9
-pixels; steps are in codes, the channel that moves most. Printed are, over frames from the tenth on, the object's mean
-step in the median and the worst frame, the largest relative step of irradiance, and the same step of the desk's own
-pixels. ``WARP_AR_FAULT_CASES`` names the cases.
+The first frame of each case of ``../shared/truth`` passes 30 times through a simulated camera, with noise alone and
+with noise and H.264. The cases are those without virtual lights, because the desk under a light has the camera's noise.
+Pixels of the object are averaged over 9 by 9 pixels. A step is the change of these means between successive frames, in
+8-bit codes of the channel that changes most. Printed are, from frame 10 on: the object's mean step, as the median over
+frames and of the worst frame; the desk's mean step of the worst frame; and the largest relative step of irradiance.
+``WARP_AR_FAULT_CASES`` names the cases, separated by commas.
 """
 
 from __future__ import annotations
@@ -23,14 +24,15 @@ from warp_ar import Pipeline
 from warp_ar.scene import load_scene
 
 FRAMES, SETTLED = 30, 10
+"""Number of frames, and number of first frames that are not measured."""
 CAMERAS = {"noise": Faults(noise=0.02), "noise, h264": Faults(noise=0.02, codec="h264")}
 DRAWN = 25
-"""Codes by which a pixel must differ from the frame's to be taken for the object's."""
+"""Difference in codes between picture and frame above which a pixel counts as the object's."""
 CASES = "plastic_bunny_sunset,gold_torus_interior,night_desk_lamp,mirror_and_chalk_studio,overexposed_desk"
 
 
 def steps(pictures: Any) -> Any:
-    """Change from frame to frame of means over 9 by 9 pixels, codes, (frames - 1, height, width)."""
+    """Return the change between successive frames of means over 9 by 9 pixels, codes, (frames - 1, height, width)."""
     means = np.array([cv2.blur(picture, (9, 9)) for picture in pictures])
     return np.abs(np.diff(means, axis=0)).max(axis=-1)
 

@@ -1,7 +1,7 @@
-"""Whole frames: frames per second, and the time of every stage.
+"""Frames per second of whole frames, and the time of every stage.
 
-On CPU stages are timed by the processor time of one core, which other programs hardly disturb; frames per second by the
-clock. On CUDA stages are timed by events on the device; the whole frame is one captured graph.
+On CPU, stages are timed by the processor time of one thread, on which other programs have little effect; frames per
+second are elapsed time. On CUDA, stages are timed by events on the device, and a whole frame is one captured graph.
 """
 
 from __future__ import annotations
@@ -28,16 +28,18 @@ from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.tracking.tracking import Tracker
 
 CLIP_FRAMES = 48
+"""Number of frames of a clip, which is repeated."""
 WARM_UP = 6
+"""Number of frames before the measured ones."""
 STREAM_FRAMES = {"": 300, ", fast camera": 3000}
-"""Frames of a stream, by the clip's clock and by a camera's that takes 1,000 a second: there a stream's first estimates
-of light are the dearest, and after two seconds they are made."""
+"""Number of frames of a stream, with the clip's times and with those of a camera of 1,000 frames per second. The first
+estimates of light are the most expensive; the fast camera's stream is long enough to contain later ones."""
 SETTLED_FRAMES = 1000
-"""The last frames of a stream, of which frames per second are given beside those of all."""
+"""Number of last frames of a stream, for which frames per second are stated separately."""
 STEPS_EVERY = 10
-"""One of so many frames of a stream is asked how long its steps took: that takes a third of a millisecond."""
+"""Stride of the frames of a stream whose steps are timed, because reading the times takes a third of a millisecond."""
 WRITTEN = 12
-"""Frames that a stream's source has written where they are sent from."""
+"""Number of frames in pinned memory, from which they are sent without a copy."""
 SIZES = {"480p": (640, 480), "1080p": (1920, 1080), "4K": (3840, 2160)}
 QUALITIES = {
     "medium": PRESETS["medium"],
@@ -47,7 +49,7 @@ QUALITIES = {
 
 @dataclasses.dataclass(frozen=True)
 class Clip:
-    """Frames of a scene at some size, with their poses."""
+    """Frames of a scene at one size, with their poses."""
 
     scene: Scene
     images: list[np.ndarray]
@@ -56,7 +58,7 @@ class Clip:
 
 @functools.cache
 def clip(name: str, size: tuple[int, int], count: int = CLIP_FRAMES) -> Clip:
-    """The first frames of a bundled scene, enlarged to ``size``; what a wider picture has more is mirrored."""
+    """Return the first frames of a bundled scene, enlarged to a size; the sides of a wider picture are mirrored."""
     scene = load_scene(name)
     camera = scene.camera
     with open_source(scene.source.path) as source:
@@ -76,7 +78,7 @@ def clip(name: str, size: tuple[int, int], count: int = CLIP_FRAMES) -> Clip:
 
 
 def measure_stages(pipeline: Pipeline, frames: Clip, count: int) -> dict[str, list[float]]:
-    """Milliseconds of each stage in every frame after warm-up, processor time of one core on CPU."""
+    """Return the milliseconds of each stage in every frame after the warm-up; processor time of one thread on CPU."""
     scheduler = pipeline._scheduler
     if pipeline.device.is_cpu:
         scheduler.clock = time.thread_time
@@ -91,7 +93,7 @@ def measure_stages(pipeline: Pipeline, frames: Clip, count: int) -> dict[str, li
 
 
 def bench_stages(label: str, frames: Clip, device: str, quality: Quality, count: int) -> None:
-    """One line per stage, and one of the sum of their medians."""
+    """Print one line per stage, and one with the sum of their medians."""
     bands = 1 if device == "cpu" else None
     with Pipeline(frames.scene, device=device, quality=quality, bands=bands, profile=True) as pipeline:
         times = measure_stages(pipeline, frames, count)
@@ -101,7 +103,7 @@ def bench_stages(label: str, frames: Clip, device: str, quality: Quality, count:
 
 
 def bench_graph(label: str, frames: Clip, device: str, quality: Quality, count: int) -> None:
-    """Device time of a whole frame as one graph, and frames per second with both ways over the bus."""
+    """Print the device time of a whole frame as one graph, and frames per second with transfers in both directions."""
     poses, images = frames.poses, frames.images
     with Pipeline(frames.scene, device=device, quality=quality) as pipeline:
         for index in range(WARM_UP):
@@ -119,7 +121,7 @@ def bench_graph(label: str, frames: Clip, device: str, quality: Quality, count: 
             times.append(wp.get_event_elapsed_time(begin, end))
         report(f"graph {label}", times, device)
 
-        # By the clip's clock, and by that of a camera as fast as this: recovery looks at the clock.
+        # Streams have the clip's times, or those of a fast camera, because the recovery of light depends on time.
         seconds = WARM_UP / 24.0
         for clock, step in (("", 1.0 / 24.0), (", fast camera", 1.0e-3)):
             bench_stream(f"{label}{clock}", pipeline, frames, seconds, step, STREAM_FRAMES[clock])
@@ -131,7 +133,7 @@ def bench_graph(label: str, frames: Clip, device: str, quality: Quality, count: 
         for name, values in measure(copies, device).items():
             report(f"bus {label} {name}", values, device)
 
-    # As a live camera's frames are lit: no frame waits for an estimate of the light.
+    # With a live camera, no frame waits for an estimate of the light.
     with Pipeline(frames.scene, device=device, quality=quality, estimates="real_time") as pipeline:
         for index in range(WARM_UP):
             pipeline(images[index], time_seconds=index * 1e-3, pose=poses[index])
@@ -141,7 +143,7 @@ def bench_graph(label: str, frames: Clip, device: str, quality: Quality, count: 
 
 
 def written_there(pipeline: Pipeline, frames: Clip) -> Clip:
-    """A few frames, forth and back, in memory of the pipeline's, where a source would have written them."""
+    """Return a few frames, forward and backward, in arrays of ``Pipeline.new_frame``, as a source would write them."""
     images = []
     for image in frames.images[:WRITTEN]:
         images.append(pipeline.new_frame())
@@ -150,15 +152,15 @@ def written_there(pipeline: Pipeline, frames: Clip) -> Clip:
 
 
 def bench_stream(label: str, pipeline: Pipeline, frames: Clip, seconds: float, step: float, count: int) -> None:
-    """Frames per second with both ways over the bus.
+    """Print the frames per second of a stream with transfers in both directions.
 
     Args:
-        label: Of the line.
-        pipeline: That has lit a few frames.
-        frames: Begun again when they end.
-        seconds: Time of the first, by the camera's clock.
-        step: From frame to frame.
-        count: Of frames.
+        label: Name of the case.
+        pipeline: Pipeline that has lit a few frames.
+        frames: Frames, which are repeated.
+        seconds: Time before the first frame, on the camera's clock.
+        step: Seconds between frames, on the camera's clock.
+        count: Number of frames.
     """
     waiting: collections.deque[Any] = collections.deque()
     submitting, each = [], []
@@ -195,10 +197,10 @@ def bench_stream(label: str, pipeline: Pipeline, frames: Clip, seconds: float, s
 
 
 def stream_frames(pipeline: Pipeline, frames: Clip, count: int) -> Iterator[tuple[float, float]]:
-    """Light frames as a live source has it: each is begun before the one ahead of it is read.
+    """Light frames as a stream: each is submitted before the picture of the one before it is read.
 
     Yields:
-        Milliseconds of a frame, by the clock and of the processor.
+        Elapsed time and processor time of each frame, milliseconds.
     """
     before = None
     for index in range(count):
@@ -211,7 +213,7 @@ def stream_frames(pipeline: Pipeline, frames: Clip, count: int) -> Iterator[tupl
 
 
 def bench_cpu_frames(label: str, frames: Clip, quality: Quality, count: int) -> None:
-    """Frames per second by the clock, tracking included, decoding and encoding not."""
+    """Print the frames per second on CPU, with tracking, without decoding and encoding."""
     with Pipeline(frames.scene, device="cpu", quality=quality) as pipeline:
         times = list(stream_frames(pipeline, frames, WARM_UP + count))[WARM_UP:]
     wall, cpu = (list(part) for part in zip(*times, strict=True))
@@ -221,7 +223,7 @@ def bench_cpu_frames(label: str, frames: Clip, quality: Quality, count: int) -> 
 
 
 def main(device: str) -> None:
-    """Everything above; parts of it where ``WARP_AR_BENCH`` names them, separated by commas."""
+    """Run all parts (``frame``, ``graph``, ``stages``), or those that ``WARP_AR_BENCH`` names, separated by commas."""
     parts = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(",")))
 
     def wanted(part: str) -> bool:

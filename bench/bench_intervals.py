@@ -1,12 +1,13 @@
-"""True if the intervals that calibrations state hold the truth: ``python -m bench intervals``.
+"""Share of random set-ups in which the intervals that calibrations state contain the truth.
 
-A hundred random set-ups each: cameras (focal length, axis, lens, noise, hand that holds the card), responses (gamma,
-S, printer, light) and mirror balls (camera, lens, room, radius, place on the cross, way of the film). An interval of
-two standard deviations must hold the truth in 95 of 100.
+``python -m bench intervals`` makes a hundred random set-ups of each kind: cameras (focal length, principal point, lens,
+noise, poses of the hand-held card), responses (gamma or S-shaped curve, printer, light) and mirror balls (camera, lens,
+environment, radius, place on the card's cross, path of the camera). An interval of two standard deviations should
+contain the truth in 95 of 100.
 
-``WARP_AR_BENCH_SETUPS`` says how many, ``WARP_AR_BENCH_OF`` of what (``camera,response,ball``). A hundred balls take
-half an hour: ``WARP_AR_BENCH_KEEP`` names a file that every set-up is appended to and read from again, so that the
-rest can be made another time.
+``WARP_AR_BENCH_SETUPS`` sets the number of set-ups, ``WARP_AR_BENCH_OF`` the kinds (``camera,response,ball``). A
+hundred balls take half an hour. ``WARP_AR_BENCH_KEEP`` names a file to which the figures of every set-up are appended;
+set-ups in it are not run again.
 """
 
 from __future__ import annotations
@@ -35,28 +36,30 @@ from warp_ar.sources.sources import open_source
 from warp_ar.tracking.card_layout import CARD_MARKER, ball_center
 
 SETUPS = 100
+"""Default number of set-ups of each kind."""
 VIEWS = 14
+"""Number of pictures of the hand-held card."""
 FRAMES = 12
-"""Of the film in which the camera moves around the ball."""
+"""Number of frames in which the camera moves around the ball."""
 CAMERA = 0.0012
-"""Share by which the focal length is off where a ball is measured: the median of the cameras here."""
+"""Relative standard deviation of the focal length with which a ball is measured: the median error of cameras here."""
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """Encoded light, 0 to 1."""
+    """Return linear values encoded as sRGB, 0 to 1."""
     value = np.clip(linear, 0.0, 1.0)
     return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
 def random_camera(rng: np.random.Generator) -> Camera:
-    """A webcam's or a phone's, at 640x480."""
+    """Return a random camera of 640x480 pixels, like that of a webcam or a phone."""
     focal = rng.uniform(480, 800)
     center = np.array([319.5, 239.5]) + rng.normal(0, 6, 2)
     return Camera(640, 480, focal, focal, *center, (rng.uniform(-0.15, 0.03), rng.uniform(-0.03, 0.05), 0.0, 0.0, 0.0))
 
 
 def hand_poses(rng: np.random.Generator, focal: float) -> list[Pose]:
-    """The card held before the camera, tilted another way each time, over all of the picture."""
+    """Return poses of a card in front of the camera, with various tilts and places in the picture."""
     found = []
     for k in range(VIEWS):
         tilt, turn = np.radians((12, 30, 45)[k % 3] + rng.uniform(-6, 6)), 2.4 * k + rng.uniform(-0.4, 0.4)
@@ -70,11 +73,11 @@ def hand_poses(rng: np.random.Generator, focal: float) -> list[Pose]:
 
 
 Figures = dict[str, list[float]]
-"""By what is measured: how far it is off and the standard deviation that was stated."""
+"""Error and stated standard deviation, by the measured quantity."""
 
 
 def calibrated(seed: int) -> Figures:
-    """A random camera; pixels."""
+    """Return the figures of a random camera's focal length, pixels."""
     rng = np.random.default_rng(seed)
     camera, card = random_camera(rng), PrintedCard(rng)
     noise = rng.uniform(0.5, 3.0)
@@ -83,7 +86,10 @@ def calibrated(seed: int) -> Figures:
 
 
 def responded(seed: int) -> Figures:
-    """A random camera's response by greys: the 95th percentile over its codes of the logarithm's error."""
+    """Return the figures of a random camera's response measured by greys.
+
+    They are those of the code at the 95th percentile of the ratio of error to deviation, as logarithms.
+    """
     rng = np.random.default_rng(seed)
     card, encode = PrintedCard(rng), smooth_curve(rng)
     camera = Camera(640, 480, 620.0, 620.0, 319.5, 239.5)
@@ -100,14 +106,14 @@ def responded(seed: int) -> Figures:
 
 @functools.cache
 def printed() -> Path:
-    """The card as a PDF, which goes with the process."""
+    """Return the path of the card as a PDF, in a temporary folder."""
     path = Path(tempfile.mkdtemp()) / "card.pdf"
     write_card(CARD_MARKER, path, "a4", 600)
     return path
 
 
 def film(desk: RandomDesk, rng: np.random.Generator, folder: Path) -> None:
-    """Write a film in which the camera moves around the card with the ball."""
+    """Write frames in which the camera moves around the card with the ball."""
     middle, half = np.radians(rng.uniform(-110, -70)), np.radians(rng.uniform(30, 70))
     far, high = rng.uniform(0.4, 0.55), rng.uniform(0.28, 0.4)
     for k in range(FRAMES):
@@ -117,7 +123,7 @@ def film(desk: RandomDesk, rng: np.random.Generator, folder: Path) -> None:
 
 
 def measured(seed: int) -> Figures:
-    """A random mirror ball; millimetres, the centre along its worst axis."""
+    """Return the figures of a random mirror ball, millimetres; the centre's error is that of its worst axis."""
     rng = np.random.default_rng(1000 + seed)
     desk = RandomDesk(printed(), 1000 + seed)
     truth = desk.camera
@@ -151,7 +157,7 @@ def _kept(path: Path | None) -> dict[tuple[str, int], Figures]:
 
 
 def main(device: str) -> None:
-    """Print how many intervals hold. Nothing runs on the device."""
+    """Print the number of intervals that contain the truth; nothing runs on the device."""
     count = int(os.environ.get("WARP_AR_BENCH_SETUPS", SETUPS))
     keep = Path(name) if (name := os.environ.get("WARP_AR_BENCH_KEEP")) else None
     known = _kept(keep)

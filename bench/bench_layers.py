@@ -1,8 +1,8 @@
-"""What each layer adds to a frame, against the picture alone, in turn; and what its file takes.
+"""Time that each layer adds to a frame, measured in turn with the picture alone; and time and size of its file.
 
-``again`` is the picture alone a second time: how far two equal programs lie apart here. ``WARP_AR_BENCH`` may say how
-many frames are measured; 30 are usual. On a CPU the time is the processor's, of one thread; on CUDA it is the clock's,
-until the layers are on the host. ``file_ms`` is the processor time of encoding a frame's OpenEXR, ``file_kb`` its size.
+``again`` is the picture alone a second time: its difference is the measurement error. ``WARP_AR_BENCH`` sets the number
+of measured frames; the default is 30. On CPU, times are processor time of one thread; on CUDA, elapsed time until the
+layers are on the host. ``file_ms`` is the processor time of encoding a frame as OpenEXR, ``file_kb`` the file's size.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ PLAIN = "picture"
 
 
 def contenders() -> dict[str, tuple[str, ...]]:
-    """Outputs by the name of what they add to the picture."""
+    """Return the outputs of each contender, by the name of the layer that it adds to the picture."""
     single = {name: ("image", name) for name in (*LAYERS, RADIANCE)}
     return {PLAIN: ("image",), "again": ("image",), **single, "all": ("image", *LAYERS)}
 
 
 def main(device: str) -> None:
-    """The desk at ``medium``, 480p."""
+    """Measure the scene ``desk`` at the default quality and 480p."""
     count = int(os.environ.get("WARP_AR_BENCH") or 30)
     frames = clip("desk", SIZES["480p"])
     clock = time.thread_time if device == "cpu" else time.perf_counter

@@ -1,13 +1,14 @@
-"""The live page on the bundled desk: frames a second served and shown, latency, growth, hostile clients.
+"""The live page on the bundled desk: frames per second, latency, growth of memory and latency, hostile clients.
 
-Server and viewers share this machine. Parts, which ``WARP_AR_BENCH`` picks, separated by commas:
+Server and clients share this machine. Parts, selected by ``WARP_AR_BENCH``, separated by commas:
 
-- ``serve``: one light client, three, one beside a client that reads nothing, one beside one that sends bad messages;
-- ``clip`` and ``camera``: Chromium shows the clip, then its own fake camera. A time code in the picture tells on the
-  screen which frame it is, and so how long ago the source gave it. Needs playwright and Chromium;
+- ``serve``: clients without a browser, called light clients. Cases: one client; three clients; one with another that
+  reads nothing; one with another that sends invalid messages.
+- ``clip`` and ``camera``: Chromium shows the clip, then frames of its own simulated camera. A time code in the picture
+  identifies the frame on the screen, from which its latency follows. This needs playwright and Chromium.
 
-``WARP_AR_BENCH_SECONDS`` is how long each case runs (default 10; 600 for ten minutes without growth). All of it takes
-6 cases of that and 15 seconds more each.
+``WARP_AR_BENCH_SECONDS`` is the duration of each of the six cases (default 10; 600 to test for growth over ten
+minutes). Each case takes 15 seconds in addition.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ TARGETS = {
 
 
 def mark(image: np.ndarray, number: int) -> np.ndarray:
-    """The picture with its number as a time code."""
+    """Return a picture with its number as a time code."""
     image = image.copy()
     for bit in range(BITS):
         image[-CELL:, bit * CELL : (bit + 1) * CELL] = 255 * (number >> bit & 1)
@@ -67,7 +68,7 @@ def mark(image: np.ndarray, number: int) -> np.ndarray:
 
 
 def write_coded_desk(folder: Path) -> tuple[Path, Path]:
-    """The bundled desk with time codes: a scene file, and its clip as Chromium's fake camera plays it."""
+    """Write the bundled desk with time codes; return its scene file, and its clip for Chromium's simulated camera."""
     scene = load_scene("desk")
     assert scene.source is not None
     assert scene.source.path is not None
@@ -89,7 +90,7 @@ def write_coded_desk(folder: Path) -> tuple[Path, Path]:
 
 
 def descendants(pid: int) -> Iterator[int]:
-    """Yield the processes that a process has started, and those that they have."""
+    """Yield the ids of the processes that a process has started, directly or indirectly."""
     with contextlib.suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
             for child in (task / "children").read_text().split():
@@ -99,13 +100,15 @@ def descendants(pid: int) -> Iterator[int]:
 
 @dataclasses.dataclass
 class Served:
-    """A server of its own."""
+    """Server process."""
 
     url: str
+    """Address of its page."""
     pid: int
+    """Process id."""
 
     def resident_mb(self) -> float:
-        """Its resident memory; not a number where the system does not tell."""
+        """Return the server's resident memory in MB; NaN if the system does not state it."""
         try:
             pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
         except OSError:
@@ -113,7 +116,7 @@ class Served:
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
     def cpu_seconds(self) -> float:
-        """Processor time that it has taken."""
+        """Return the processor time that the server has used."""
         return _cpu_seconds(self.pid)
 
 
@@ -127,7 +130,7 @@ def _cpu_seconds(pid: int) -> float:
 
 @contextlib.contextmanager
 def served(device: str, scene: str = "desk") -> Iterator[Served]:
-    """Start a server; end it whatever happens."""
+    """Context with a running server, which is ended on exit."""
     command = [sys.executable, "-m", "warp_ar.live", scene, "--device", device, "--port", "0", "--no-browser"]
     with (
         tempfile.TemporaryFile("w+") as errors,
@@ -150,27 +153,31 @@ def served(device: str, scene: str = "desk") -> Iterator[Served]:
 
 @dataclasses.dataclass
 class Growth:
-    """Memory and latency over a case: the last third's median less the first's."""
+    """Growth of memory and latency over a case: the median of the last third minus that of the first."""
 
     server: Served
+    """The measured server."""
     memory: list[float] = dataclasses.field(default_factory=list)
+    """Samples of resident memory, MB."""
     latency: list[tuple[float, float]] = dataclasses.field(default_factory=list)
-    """When, and milliseconds."""
+    """Time of measurement, and latency in milliseconds."""
     cpu: float = 0.0
+    """Processor time of the server at the start, seconds."""
     start: float = 0.0
+    """Time of the start, seconds."""
 
     def begin(self) -> None:
-        """From here on it counts."""
+        """Start the measurement."""
         self.memory.clear()
         self.latency.clear()
         self.cpu, self.start = self.server.cpu_seconds(), time.monotonic()
 
     def sample(self) -> None:
-        """Look at the memory; to be called at even intervals."""
+        """Store the present memory; call this at regular intervals."""
         self.memory.append(self.server.resident_mb())
 
     def figures(self, frames: int) -> dict[str, Any]:
-        """What the report says."""
+        """Return the figures for the report: frames per second, processor time, memory and growth."""
         cpu = self.server.cpu_seconds() - self.cpu
         figures: dict[str, Any] = {
             "fps": round(frames / (time.monotonic() - self.start), 2),
@@ -192,7 +199,14 @@ class Growth:
 
 
 async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bool = False) -> dict[str, Any]:
-    """A light client: takes pictures and shows none. One that does not read only keeps its connection open."""
+    """Run a client without a browser and return its figures.
+
+    Args:
+        growth: Measurement of the server.
+        seconds: Duration after the warm-up.
+        reads: False for a client that only keeps its connection open.
+        counts: True if this client's frames are measured by ``growth``.
+    """
     delays: list[float] = []
     frames, begun, plan = 0, False, 0
     start = time.monotonic()
@@ -217,7 +231,7 @@ async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bo
                 await socket.send_str(json.dumps({"type": "ack", "id": header["id"]}))
                 now = time.monotonic()
                 if header["plan"] != plan:
-                    # Another pipeline has taken over, or the first: what came before does not count.
+                    # A new pipeline lights the frames; those before it are not counted.
                     plan, start, begun, frames = header["plan"], now, False, 0
                     delays.clear()
                 if now - start < WARM_SECONDS:
@@ -227,7 +241,7 @@ async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bo
                     if counts:
                         growth.begin()
                 frames += 1
-                # Both processes read the same clock.
+                # The monotonic clock is common to both processes.
                 delays.append(1e3 * now - header["taken"])
                 if counts:
                     growth.latency.append((now, delays[-1]))
@@ -237,7 +251,7 @@ async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bo
 
 
 async def fuzz(url: str, stop: asyncio.Event) -> int:
-    """Send bad messages until told to stop, coming back after each, for each costs the connection; returns how many."""
+    """Send invalid messages until ``stop`` is set, each by a new connection; return their number."""
     rng, count = random.Random(0), 0
     async with aiohttp.ClientSession() as session:
         while not stop.is_set() and count < FUZZ_MESSAGES:
@@ -245,7 +259,7 @@ async def fuzz(url: str, stop: asyncio.Event) -> int:
             with contextlib.suppress(ProtocolError):
                 if isinstance(message, str):
                     parse_text(message)
-                    continue  # it would be done, and the scene would no longer be the one that is measured
+                    continue  # a valid message would change the scene that is measured
             count += 1
             with contextlib.suppress(aiohttp.ClientError, ConnectionError):
                 async with session.ws_connect(f"{url}live", max_msg_size=1 << 24) as socket:
@@ -256,7 +270,7 @@ async def fuzz(url: str, stop: asyncio.Event) -> int:
 
 
 async def serving(device: str, case: str, server: Served) -> None:
-    """One of the cases without a browser."""
+    """Run and report a case of the part ``serve``."""
     growth = Growth(server)
     first = view(growth, SECONDS, counts=True)
     extra: dict[str, Any] = {}
@@ -288,7 +302,7 @@ def _report(case: str, delays: list[float], device: str, **figures: Any) -> None
 
 # ---------------------------------------------------------------------------------------------------------- the browser
 
-# Which frame is on the canvas, or in the camera's picture, and when.
+# Records the number of the frame on the canvas, and of that in the camera's picture, with their times.
 WATCH = f"""() => {{
   if (window.bench) return;  // from an earlier case
   const strip = document.createElement("canvas").getContext("2d", {{ willReadFrequently: true }});
@@ -315,19 +329,24 @@ WATCH = f"""() => {{
 
 
 def clip_delays(shown: list[list[Any]], wall: float) -> list[float]:
-    """Milliseconds from source to screen of the clip's frames.
+    """Return the milliseconds from source to screen of the clip's frames.
 
     Args:
-        shown: Code on the screen, the header's id and time of the source (the server's monotonic clock), time of the
-            screen (wall clock), state of the marker.
-        wall: The wall clock less the monotonic one.
+        shown: For each shown frame: code on the screen, the header's id and time of the source (the server's monotonic
+            clock), time on the screen (wall clock), state of the marker.
+        wall: Wall clock minus monotonic clock, milliseconds.
     """
-    # The frame that a header speaks of, and the one on the screen, which a faulty page might confuse.
+    # Frames are used only if the code on the screen is that of the header, which a faulty page might confuse.
     return [at - (taken + wall) for code, id, taken, at, _ in shown if code == (id - 1) % FRAMES]
 
 
 def camera_delays(shown: list[list[Any]], taken: list[list[float]]) -> list[float]:
-    """Milliseconds from the camera to the screen: the code on the screen, and when the camera last gave that code."""
+    """Return the milliseconds from camera to screen: from the time when the camera last gave the code on the screen.
+
+    Args:
+        shown: For each shown frame, five values of which the code and the time on the screen are used.
+        taken: Code and time of each frame of the camera.
+    """
     times: dict[int, list[float]] = collections.defaultdict(list)
     for code, at in taken:
         times[int(code)].append(at)
@@ -341,7 +360,7 @@ def camera_delays(shown: list[list[Any]], taken: list[list[float]]) -> list[floa
 
 @contextlib.contextmanager
 def browsing(camera: Path, server: Served) -> Iterator[Any]:
-    """The page in Chromium, whose camera plays a file; None without playwright and Chromium."""
+    """Context with the page in Chromium, whose simulated camera plays a file; None without playwright and Chromium."""
     chromium = find_chromium()
     if chromium is None:
         yield None
@@ -365,7 +384,7 @@ def browsing(camera: Path, server: Served) -> Iterator[Any]:
 
 
 def showing(device: str, case: str, page: Any, server: Served) -> None:
-    """Clip or camera in Chromium."""
+    """Run and report the case ``clip`` or ``camera`` in Chromium."""
     if case == "camera":
         page.click("#use-camera")
     page.wait_for_timeout(1e3 * WARM_SECONDS)
@@ -384,7 +403,7 @@ def showing(device: str, case: str, page: Any, server: Served) -> None:
     wall = 1e3 * (time.time() - time.monotonic())
     delays = clip_delays(shown, wall) if case == "clip" else camera_delays(shown, taken)
     growth.latency = [(0.0, delay) for delay in delays]
-    # A picture that is shown twice is one.
+    # A picture that is shown twice counts once.
     new = sum(before[0] != after[0] for before, after in itertools.pairwise(shown))
     _report(
         case,

@@ -1,9 +1,9 @@
-"""What is asked of a CUDA machine beside what it does, in one run of less than five minutes, as a table.
+"""Table of targets for a CUDA machine and of measured values, made in less than five minutes.
 
-Starts come first, in caches of their own that the other parts then use: nothing cached, seen before, another scene at
-``high``. Then whole frames at 480p, 1080p and 4K, streams, and frames on the host's cores. What these print is printed;
-a part for which no time is left is named. ``WARP_AR_BENCH`` may name parts, separated by commas: ``start``, ``frame``,
-``streams``, ``cores``.
+The first part, ``start``, measures starts of the program: with empty caches, with a scene started before, and with
+another scene at ``high``. Other parts use its caches: ``frame`` (whole frames at 480p, 1080p and 4K), ``streams``, and
+``cores`` (frames on the host's cores). Their output is printed as well. A part that the time does not allow is not run.
+``WARP_AR_BENCH`` may name parts, separated by commas.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from bench.bench_start import cache_variables, start
 from bench.common import commit
 
 SECONDS = 290.0
-"""After which nothing is begun, and what is under way ends."""
+"""Time in seconds after which no part is begun, and a running one is ended."""
 STARTS: Mapping[str, tuple[str, str]] = {
     "cold": ("desk", "medium"),
     "seen": ("desk", "medium"),
     "new scene high": ("torus", "high"),
 }
 PARTS: Mapping[str, str] = {"frame": "graph", "streams": "1080,60,1,4,16,8x2,16x1", "cores": "480,1"}
-"""Benches, and what ``WARP_AR_BENCH`` tells them."""
+"""Benchmarks to run, with the value of ``WARP_AR_BENCH`` for each."""
 MARKS: Mapping[str, tuple[str, str, str]] = {
     "nothing cached, s": ("15", "start cold", "median_s"),
     "seen before, s": ("2", "start seen", "median_s"),
@@ -62,11 +62,19 @@ MARKS: Mapping[str, tuple[str, str, str]] = {
     "16 cores over 2": ("3.5", "cores 480p 16", "of_2"),
     "processor time on 16 cores over that on 2": ("at most 1.3", "cores 480p 16", "busy_of_2"),
 }
-"""What is asked, the case and the field that say what is reached."""
+"""Target of each line of the table, and the case and field with the measured value."""
 
 
 def run_part(name: str, asked: str, device: str, caches: Path, end: float) -> dict[str, dict[str, Any]]:
-    """Run a bench in a process of its own and hand on what it prints; its records, by case."""
+    """Run a benchmark in a separate process, print its output, and return its records by case.
+
+    Args:
+        name: Name of the benchmark.
+        asked: Value of ``WARP_AR_BENCH`` for it.
+        device: Option ``--device``.
+        caches: Folder of caches.
+        end: Time on the performance counter at which it is ended.
+    """
     environment = {**os.environ, **cache_variables(caches), "WARP_AR_BENCH": asked}
     command = [sys.executable, "-m", "bench", name, "--device", device]
     found: dict[str, dict[str, Any]] = {}
@@ -86,7 +94,7 @@ def run_part(name: str, asked: str, device: str, caches: Path, end: float) -> di
 
 
 def add_ratios(found: dict[str, dict[str, Any]]) -> None:
-    """Put frames on many cores beside those on two."""
+    """Add the ratios of times on two cores to those on other numbers of cores."""
     base = found.get("cores 480p 2")
     for case, record in found.items():
         if base is not None and case.startswith("cores 480p"):
@@ -95,7 +103,7 @@ def add_ratios(found: dict[str, dict[str, Any]]) -> None:
 
 
 def main(device: str) -> None:
-    """All parts, or those that the environment names, and the table."""
+    """Run all parts, or those that ``WARP_AR_BENCH`` names, and print the table."""
     begun = time.perf_counter()
     wanted = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(","))) or {"start", *PARTS}
     found: dict[str, dict[str, Any]] = {}

@@ -1,11 +1,11 @@
-"""Recovered light against light as captured, over random tables: no card, grey cards, wrong responses, clutter.
+"""Error of recovered light and of captured light over random tables, some without card, with grey cards or clutter.
 
     WARP_AR_SHARED=../shared python -m bench.bench_never_worse --count 300    # ten minutes on two cores
     python -m bench never_worse                                               # 20 of them
 
-Prints the relative error of irradiance over all directions with recovery and without, their ratio, and how often the
-interval of irradiance holds the truth; one JSON line in all. Without ``WARP_AR_SHARED`` the room is a made-up one, and
-the figures are others: ``made_up`` says for how many tables it was.
+The relative errors of irradiance over all directions with and without recovery are printed, their ratio, and the share
+of intervals of irradiance that contain the truth; the last line is JSON. Without ``WARP_AR_SHARED`` the environment is
+a generated one, which gives other figures; ``made_up`` is the number of such tables.
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ NO_WORSE = 1.02
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What one set-up became."""
+    """Errors of one set-up."""
 
     clipped: float
-    """Relative error of irradiance over all directions, of the light as captured."""
+    """Relative error of irradiance over all directions with the captured light."""
     recovered: float
-    """The same of what the program makes of it."""
+    """Relative error of irradiance over all directions with recovered light."""
     held: float
-    """Share of the interval's 18 numbers that hold the truth."""
+    """Share of the 18 intervals of irradiance (six directions, three channels) that contain the truth."""
     method: str
-    """What the estimate rests on."""
+    """Method of the estimate."""
 
     @property
     def ratio(self) -> float:
-        """Of the errors."""
+        """Ratio of the error with recovered light to that with captured light."""
         return self.recovered / max(self.clipped, 1e-9)
 
 
 def irradiance(environment: NDArray[Any], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Irradiance by normal, (k, 3)."""
+    """Return the irradiance of surfaces with normals (k, 3) under a latlong map, (k, 3)."""
     small = cv2.resize(np.asarray(environment, np.float32), (128, 64), interpolation=cv2.INTER_AREA)
     d, area = latlong_directions(64, 128)
     return np.asarray(np.maximum(normals @ d.reshape(-1, 3).T, 0.0) @ (small.reshape(-1, 3) * area.reshape(-1, 1)))
 
 
 def evaluate(setup: Setup, *, device: str = "cpu", quality: str = DEFAULT_PRESET) -> Outcome:
-    """Run a preset on one picture."""
+    """Return the errors of a preset on one picture."""
     pipeline = Pipeline(loads_scene(setup.scene), device=device, quality=PRESETS[quality], outputs=("environment",))
     try:
         result = pipeline(setup.image, time_seconds=0.0, pose=Pose(setup.rotation, setup.translation))
@@ -80,7 +80,7 @@ def evaluate(setup: Setup, *, device: str = "cpu", quality: str = DEFAULT_PRESET
 
 
 def summarise(outcomes: list[Outcome]) -> dict[str, float]:
-    """Figures over all set-ups."""
+    """Return figures over set-ups: quantiles of ratios, means of errors, and share of intervals with the truth."""
     ratios = np.array([outcome.ratio for outcome in outcomes])
     return {
         "count": len(outcomes),
@@ -94,7 +94,7 @@ def summarise(outcomes: list[Outcome]) -> dict[str, float]:
 
 
 def main(device: str, first: int = 0, count: int = 20, quality: str = DEFAULT_PRESET) -> None:
-    """Evaluate set-ups and print figures, by kind of card and in all."""
+    """Evaluate set-ups, and print figures by kind of card and over all."""
     outcomes: dict[str, list[Outcome]] = {}
     made_up = 0
     for seed in range(first, first + count):

@@ -1,12 +1,13 @@
-"""One photograph of a mirror ball against the merged bracket that it is from, over a folder of one's own brackets.
+"""Error of light captured from one photograph of a mirror ball, compared with the bracket that contains it.
 
     python -m bench photographs --folder=FOLDER    # FOLDER/NAME/*.jpg: a bracket each, the ball in every picture
 
-Each photograph is captured alone and compared with all of its folder, in its own camera values: relative error of
-irradiance over all directions, as it is and after one scale. The bracket clipped at the photograph's white level tells
-what clipping alone takes; what is left is the response, noise and the ball's outline. Where names or EXIF contradict
-each other, ``exposures.txt`` beside the pictures holds their seconds, in order of their names; the word ``pixels`` in
-it leaves them to the pixels. One JSON line in all.
+Light is captured from each photograph alone and from the whole bracket, in the photograph's camera values. The error is
+the relative difference of irradiance over all directions, as it is and after scaling by the best common factor. The
+bracket's light, clipped at the photograph's white level, gives the part of the error that is due to clipping; the rest
+is due to the response, noise and the ball's outline. If exposures in names and EXIF contradict each other,
+``exposures.txt`` in the folder states them in seconds, in the order of the names; the word ``pixels`` in it means that
+they are estimated from the pixels. The last line is JSON.
 """
 
 from __future__ import annotations
@@ -36,45 +37,52 @@ from warp_ar.stages.quality import DEFAULT_PRESET
 
 Array = NDArray[np.float64]
 REFLECTANCE = 0.85
-"""Of the ball, as ``capture`` takes it: radiance of 1 / REFLECTANCE clips."""
+"""Reflectance of the ball that ``capture`` assumes: light of radiance 1 / REFLECTANCE clips in it."""
 BRIGHTER = 1.25
-"""Times a photograph's level of clipping that its bracket must show to tell what it lacks."""
+"""Smallest ratio of the bracket's brightest light to a photograph's clipping level, for the photograph to be used."""
 BALL = 0.04
-"""Its radius, metres: a guess, which no light depends on."""
+"""Assumed radius of the ball, metres; the light does not depend on it."""
 CONTACT = 0.93
-"""Radii below a ball's middle at which it is taken to touch its support."""
+"""Distance in the picture of the assumed point of contact below the ball's centre, in radii."""
 SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One photograph."""
+    """Relative errors of irradiance for one photograph."""
 
     name: str
+    """Name of its folder and file."""
     error: float
-    """Relative error of irradiance of the light that it alone gives."""
+    """Error of the light from the photograph alone."""
     scaled: float
-    """The same after one scale."""
+    """Error of the light from the photograph alone, after scaling by the best common factor."""
     clipping: float
-    """The same of the bracket's light, clipped where this photograph clips."""
+    """Error of the bracket's light, clipped where this photograph clips."""
     rest: float
-    """Of the photograph's light against that."""
+    """Difference between the photograph's light and the clipped light of the bracket."""
     lower_bound: float
     """Share of the bracket's light that is a lower bound."""
     default: float = 0.0
-    """Of the light that the program's default quality makes of the photograph."""
+    """Error of the light that a pipeline of the default quality finds in the photograph."""
     captured: float = 0.0
-    """Of the light that it has without recovery."""
+    """Error of the light that a pipeline without recovery finds in the photograph."""
 
 
 def support_below(outline: BallOutline, camera: Camera) -> Support:
-    """The plane that a ball is taken to stand on."""
+    """Return the plane on which a ball is assumed to stand."""
     x, y = outline.center
     return plane_from_contact(outline.sphere, camera, (x, y + CONTACT * outline.radius), BALL)
 
 
 def run_program(found: Capture, device: str, **methods: str) -> NDArray[Any]:
-    """Light at the ball in a scene that shows the photograph and claims a card, (h, 2 h, 3)."""
+    """Return the light that a pipeline finds in a photograph, (h, 2 h, 3).
+
+    Args:
+        found: Capture from the photograph. The scene made from it states that there is a card, which is not visible.
+        device: Device of the pipeline.
+        methods: Methods that replace those of the default quality.
+    """
     assert found.support is not None
     pose = found.support.pose
     x, y, z = (float(v) for v in pose.inverse().apply(BALL * np.array(found.outline.sphere)))
@@ -92,12 +100,19 @@ def run_program(found: Capture, device: str, **methods: str) -> NDArray[Any]:
 
 
 def relative_error(found: Array, truth: Array) -> float:
-    """Of irradiance, over directions and channels."""
+    """Return the relative error of irradiance over directions and channels."""
     return float(np.linalg.norm(found - truth) / max(float(np.linalg.norm(truth)), 1e-12))
 
 
 def compare(name: str, single: NDArray[Any], merged: NDArray[Any], lower_bound: float) -> Row:
-    """Figures of one photograph, from two maps (h, 2 h, 3) in its camera values."""
+    """Return the errors of one photograph.
+
+    Args:
+        name: Name of the photograph.
+        single: Light from it alone, (h, 2 h, 3), in its camera values.
+        merged: Light from the bracket, in the photograph's camera values.
+        lower_bound: Share of the bracket's light that is a lower bound.
+    """
     normals = latlong_directions(24, 48)[0].reshape(-1, 3)
     clipped = np.minimum(merged, 1.0 / REFLECTANCE)
     found, truth, limit = (irradiance(one, normals) for one in (single, merged, clipped))
@@ -113,16 +128,20 @@ def compare(name: str, single: NDArray[Any], merged: NDArray[Any], lower_bound: 
 
 
 def tells(merged: NDArray[Any]) -> bool:
-    """Return whether a bracket's light, (h, 2 h, 3) in a photograph's camera values, is above where that clips."""
+    """Return True if a bracket's light is clearly brighter than a photograph's clipping level.
+
+    Args:
+        merged: Light from the bracket, (h, 2 h, 3), in the photograph's camera values.
+    """
     return float(merged.max()) > BRIGHTER / REFLECTANCE
 
 
 def read_set(folder: Path, neutral: Path) -> tuple[list[Path], list[float] | None]:
-    """Photographs of a set, and their exposures where a file tells them.
+    """Return the photographs of a set, and their exposures in seconds if ``exposures.txt`` states them.
 
     Args:
-        folder: Of the set.
-        neutral: Where copies without names and EXIF may lie.
+        folder: Folder of the set.
+        neutral: Folder for copies without meaningful names and EXIF, which are made if the file says ``pixels``.
     """
     photos = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     told = folder / "exposures.txt"
@@ -137,7 +156,7 @@ def read_set(folder: Path, neutral: Path) -> tuple[list[Path], list[float] | Non
 
 
 def measure_set(folder: Path, device: str) -> list[Row]:
-    """All photographs of a set, each against the bracket."""
+    """Return the errors of all photographs of a set, compared with the bracket."""
     rows = []
     with tempfile.TemporaryDirectory() as neutral:
         photos, exposures = read_set(folder, Path(neutral))
@@ -171,13 +190,13 @@ def measure_set(folder: Path, device: str) -> list[Row]:
 
 
 def summarise(sets: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
-    """Means of each set over its photographs, and of all sets, each counting once; a set without any is left out.
+    """Return mean errors of each set and over all sets; a set without photographs is left out.
 
     Args:
-        sets: Figures by a set's name.
+        sets: Errors of photographs by the set's name.
 
     Returns:
-        ``sets``, a dict of means each; then the means over them, None where there are none.
+        Means of each set under ``sets``, and the means over these with equal weights, None if there are none.
     """
     keys = ("error", "scaled", "clipping", "default", "captured")
     means = {
@@ -190,7 +209,7 @@ def summarise(sets: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
 
 
 def main(device: str, arguments: Sequence[str] = ()) -> None:
-    """Measure all sets of a folder and print figures of each and of all."""
+    """Measure all sets of a folder and print the figures of each and of all."""
     parser = argparse.ArgumentParser(prog="python -m bench photographs", description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, help="a folder of brackets, a folder each")
     options = parser.parse_args(list(arguments))

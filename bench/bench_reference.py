@@ -1,10 +1,10 @@
-"""The path tracer on bundled scenes: rays a second beside the bare rate, and the time to an error of 1 %.
+"""The path tracer on bundled scenes: rays per second, compared with primary rays, and the time to an error of 1 %.
 
     python -m bench reference [--scenes torus,desk,mirror] [--size WxH] [--samples N] [--runs N] [--device D]
 
-Bare is one ray through the middle of every pixel to the first surface, objects included, and nothing else. The time to
-1 % is that of finding what proxies reflect, and that of the samples that were taken times the square of their error
-over 1 %: what is left falls with the root of their number.
+``bare`` is the rate of primary rays: one ray through the centre of every pixel to the first surface, and nothing else.
+The time to 1 % is the time to estimate the reflectance of proxies, plus that of the samples multiplied by the square of
+the ratio of their error to 1 %, because the error falls with the square root of the number of samples.
 """
 
 from __future__ import annotations
@@ -31,15 +31,18 @@ from warp_ar.scene import load_scene
 
 CASES = ("torus", "desk", "mirror")
 FRAME = 6
+"""Index of the traced frame."""
 BAND = 8
-"""Rows of bare rays that a thread takes at a time."""
+"""Number of rows of primary rays that a thread traces at a time."""
 SIZES = {"cpu": (160, 120), "cuda": (1440, 1080)}
 STEPS = {"cpu": 2, "cuda": 4}
-"""Samples per pixel of one timed call."""
+"""Number of samples per pixel of one timed call."""
 RUNS = 12
+"""Number of timed calls."""
 SAMPLES = 64
-"""Per pixel, for the time to an error."""
+"""Number of samples per pixel for the time to an error."""
 WANTED = 0.01
+"""Relative error to which the time is extrapolated."""
 
 
 @functools.cache
@@ -60,7 +63,7 @@ def make_primary_kernel(trace: TraceConfig) -> wp.Kernel:
 
 
 class Primary:
-    """One ray per pixel, by as many threads as paths are followed by."""
+    """Primary rays of a path tracer's picture, traced by as many threads as its paths."""
 
     def __init__(self, tracer: PathTracer) -> None:
         self.tracer = tracer
@@ -69,12 +72,12 @@ class Primary:
         self.kernel = make_primary_kernel(tracer._config)
 
     def launch(self, rows: tuple[int, int] | None) -> None:
-        """A band of rows."""
+        """Trace a band of rows; None: all rows."""
         inputs = [self.tracer._params, self.tracer._local]
         launch_rows(self.kernel, self.shape, inputs, [self.depth], rows=rows, device=self.tracer.device)
 
     def __call__(self) -> None:
-        """All rows."""
+        """Trace all rows, on CPU in bands on all cores."""
         if not self.tracer.device.is_cpu:
             self.launch(None)
             return
@@ -99,10 +102,10 @@ def main(device: str, arguments: list[str] | None = None) -> None:
 
 
 def measure_scene(name: str, size: tuple[int, int], count: int, runs: int, device: str) -> None:
-    """One scene: the time to an error, then both rates in turn."""
+    """Measure one scene: the time to an error, then both rates in turn."""
     kind = "cpu" if wp.get_device(device).is_cpu else "cuda"
     known = light_up_to(load_scene(name), FRAME, quality="high", device=device)
-    # Kernels are loaded by a picture that does not count.
+    # A small picture, which is not timed, loads the kernels.
     known.tracer(device=device, size=(64, 48)).sample(1)
     tracer = known.tracer(device=device, size=size)
     begun = time.perf_counter()
@@ -143,13 +146,17 @@ def measure_scene(name: str, size: tuple[int, int], count: int, runs: int, devic
 
 
 def _encoded(tracer: PathTracer) -> np.ndarray:
-    """The frame that the tracer has, as sRGB from 0 to 1."""
+    """Return the tracer's frame as sRGB, 0 to 1."""
     linear = np.clip(tracer._local.radiance.numpy(), 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _measure(contenders: dict, device: str, runs: int) -> dict[str, list[float]]:
-    """In turn; by the clock of the host on CUDA as well, for sampling counts what is done."""
+    """Return milliseconds of contenders, timed in turn.
+
+    On CUDA they are elapsed time on the host too, because sampling depends on the samples so far and cannot be replayed
+    as a graph.
+    """
     if wp.get_device(device).is_cpu:
         return measure(contenders, device, runs=runs)
     times: dict[str, list[float]] = {name: [] for name in contenders}

@@ -1,19 +1,19 @@
-"""Spread of recovered light and picture over what should not matter, on the open cases of ``../shared/truth``.
+"""Spread of recovered light and of the picture under changes that should not matter, on cases of ``../shared/truth``.
 
     python -m bench stability [--draws noise,dropped,rows,pose,tables] [--count 16] [--quality high]
 
-Each case is run once for each number below ``--count``, by each kind of draw:
+Each case is run ``--count`` times for each kind of change:
 
-- ``noise``: its frames under Gaussian noise of so many codes;
-- ``dropped``: three frames of ten, drawn anew, do not come; the first and the last do. Where a case's light changes
-  within its third of a second (mirror, night, overexposed), the spread is how late the estimate follows;
-- ``rows``: the map has 64, 96, 128, 192 or 256 rows;
-- ``pose``: the camera's principal point is off by a pixel, each time to another side;
-- ``tables``: ten random tables, a picture each, under noise.
+- ``noise``: Gaussian noise, in 8-bit codes, on its frames;
+- ``dropped``: three of ten frames, drawn at random, are missing, but not the first and the last. If a case's light
+  changes during its third of a second (mirror, night, overexposed), the spread also contains the lag of the estimate;
+- ``rows``: an environment map of 64, 96, 128, 192 or 256 rows;
+- ``pose``: the camera's principal point displaced by a pixel, in a different direction each time;
+- ``tables``: ten random tables with noise, one picture each.
 
-Per case one JSON line: relative error of the last frame's irradiance over all directions, its mean and the 10th and
-90th percentile, percent; ``spread`` is their difference, ``picture`` that of the share of the last picture's error that
-is left, ``power`` that of all emitters' power over its mean.
+One JSON line per case, in percent: ``mean``, ``p10`` and ``p90`` of the relative error of the last frame's irradiance
+over all directions. ``spread`` is the difference of the two percentiles; ``picture`` is that of the ratio of the last
+picture's error to the error without objects; ``power`` is that of the power of all emitters, relative to its mean.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ KINDS = ("noise", "dropped", "rows", "pose", "tables")
 ROWS = (64, 96, 128, 192, 256)
 TABLES = 10
 DROPPED = 0.3
-"""Share of frames that do not come."""
+"""Share of frames that are missing."""
 
 Measures = tuple[float, float, float]
-"""Relative error of irradiance; share of the picture's error that is left; power of all emitters."""
+"""Relative error of irradiance; ratio of the picture's error to that without objects; power of all emitters."""
 
 
 def noisy(image: NDArray[np.uint8], rng: np.random.Generator, noise: float) -> NDArray[np.uint8]:
-    """A picture under noise of so many codes."""
+    """Return a picture with Gaussian noise of a standard deviation in codes."""
     return np.clip(np.round(image + rng.normal(0.0, noise, image.shape)), 0, 255).astype(np.uint8)
 
 
@@ -58,12 +58,12 @@ def light_error(environment: object, truth: object) -> float:
 
 
 def emitted(pipeline: Pipeline) -> float:
-    """Return the power of all emitters that were found."""
+    """Return the total power of the emitters that were found."""
     return float(sum(np.mean(one["power"]) for one in pipeline.arrays["recover_status"]().get("emitters", ())))
 
 
 def left_of(case: Path, name: str, picture: NDArray[np.uint8]) -> float:
-    """Return the share of a picture's error that is left where the virtual object changes it."""
+    """Return the ratio of a picture's FLIP to that of the frame without the object, where the object changes it."""
     camera, truth = (read_image(case / folder / name) for folder in ("camera", "object"))
     assert camera is not None
     assert truth is not None
@@ -73,7 +73,15 @@ def left_of(case: Path, name: str, picture: NDArray[np.uint8]) -> float:
 
 
 def measure_case(case: Path, kind: str, number: int, given: argparse.Namespace, device: str) -> Measures:
-    """Run a case once and measure its last frame."""
+    """Run a case once and return the measures of its last frame.
+
+    Args:
+        case: Folder of the case.
+        kind: Kind of change.
+        number: Number of the draw.
+        given: Options of the command.
+        device: Device of the pipeline.
+    """
     scene, rng = load_scene(case / "scene_object.toml"), np.random.default_rng(number)
     quality, camera = PRESETS[given.quality], scene.camera
     if kind == "rows":
@@ -102,7 +110,7 @@ def measure_case(case: Path, kind: str, number: int, given: argparse.Namespace, 
 
 
 def measure_table(table: int, number: int, given: argparse.Namespace, device: str) -> Measures:
-    """Run a random table once; there is no picture to compare with."""
+    """Run a random table once and return its measures; that of the picture is NaN, because there is no true one."""
     setup = make_setup(table)
     with Pipeline(
         loads_scene(setup.scene), device=device, quality=PRESETS[given.quality], outputs=("environment",)
@@ -113,13 +121,13 @@ def measure_table(table: int, number: int, given: argparse.Namespace, device: st
 
 
 def spread_of(values: NDArray[np.float64]) -> float:
-    """Return the 90th less the 10th percentile."""
+    """Return the difference between the 90th and the 10th percentile."""
     low, high = np.quantile(values, (0.1, 0.9))
     return float(high - low)
 
 
 def summarise(draws: Sequence[Measures]) -> dict[str, float]:
-    """Figures over all draws of a case, percent; what was not measured is left out."""
+    """Return figures over all draws of a case, percent, without those that were not measured."""
     light, picture, power = 100.0 * np.array(draws).T
     low, high = np.quantile(light, (0.1, 0.9))
     figures = {"mean": light.mean(), "p10": low, "p90": high, "spread": spread_of(light), "picture": spread_of(picture)}
@@ -128,7 +136,7 @@ def summarise(draws: Sequence[Measures]) -> dict[str, float]:
 
 
 def main(device: str, arguments: Sequence[str] = ()) -> None:
-    """Run all cases and print a line for each, and one for the mean of each kind of draw."""
+    """Run all cases; print a line for each, and for each kind of change one with mean and largest spread."""
     parser = argparse.ArgumentParser(prog="python -m bench stability")
     parser.add_argument("--draws", default=",".join(KINDS))
     parser.add_argument("--count", type=int, default=16, help="draws of each kind (default: %(default)s)")

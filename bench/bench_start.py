@@ -1,9 +1,9 @@
-"""Seconds from the command to its first picture on the disk: nothing cached, a scene of another kind, one seen before.
+"""Time from the start of the command until its first picture is on the disk.
 
-Each is a process of its own. Cases: ``cold``, with empty caches; ``seen``, the same scene again; ``new``, scenes whose
-combination of shapes, materials, lights and textures the caches have not met, each once; ``quality``, the first scene
-at another preset; ``high``, another scene at that preset. ``WARP_AR_BENCH`` may name cases, separated by commas. Beside
-the clock there is the time that all threads were busy, which other programs hardly disturb.
+Each case is a separate process: ``cold``, with empty caches; ``seen``, the same scene again; ``new``, scenes with
+combinations of shapes, materials, lights and textures that are not in the caches, once each; ``quality``, the first
+scene at the preset ``high``; ``high``, another scene at that preset. ``WARP_AR_BENCH`` may name cases, separated by
+commas. Elapsed time is measured, and processor time of all threads, on which other programs have little effect.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ NEW: Mapping[str, str] = {
     "box, two lights": _TABLE + _BOX + _SPHERE.format(model="phong") + "diffuse = [0.2, 0.4, 0.7]\n" + _POINT + _SUN,
     "mirror, no light": _TABLE + _BOX + _SPHERE.format(model="mirror"),
 }
-"""Parts of scenes that no bundled scene combines so; camera, marker, ball and frames are those of ``desk``."""
+"""Objects, lights and proxies in combinations that no bundled scene has; the rest of the scene is that of ``desk``."""
 
 
 def write_scene(parts: str, folder: Path, name: str) -> Path:
-    """A scene file with the head of ``desk`` and other things in it."""
+    """Write a scene file with the camera, marker, ball and frames of ``desk`` and other parts; return its path."""
     desk = bundled_scenes()["desk"]
     text = desk.read_text(encoding="utf-8")
     head = text[: text.index("[[proxy]]")].replace('path = "', f'path = "{desk.parent.as_posix()}/')
@@ -45,15 +45,23 @@ def write_scene(parts: str, folder: Path, name: str) -> Path:
 
 
 def cache_variables(caches: Path) -> dict[str, str]:
-    """What has a process keep kernels, meshes and checks in a folder."""
+    """Return the environment variables with which a process stores kernels, meshes and checks in a folder."""
     return {"WARP_CACHE_PATH": str(caches / "kernels"), "XDG_CACHE_HOME": str(caches)}
 
 
 def start(scene: str, device: str, caches: Path, target: Path, quality: str = "medium") -> tuple[float, float]:
-    """Milliseconds until the first picture is written, and of all threads."""
+    """Return the milliseconds until the first picture is written, and those of processor time.
+
+    Args:
+        scene: Name or path of the scene.
+        device: Option ``--device``.
+        caches: Folder of caches.
+        target: Folder for the picture.
+        quality: Name of the preset.
+    """
     command = [sys.executable, "-m", "warp_ar.live", scene, "--headless", "--frames", "1", "--device", device]
     environment = {**os.environ, **cache_variables(caches)}
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package has its bytecode
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # bytecode is cached, as for an installed package
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([*command, "--quality", quality, "--output", str(target)], env=environment, check=True)
     spent, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -62,7 +70,7 @@ def start(scene: str, device: str, caches: Path, target: Path, quality: str = "m
 
 
 def main(device: str) -> None:
-    """All cases, or those that the environment names."""
+    """Measure all cases, or those that ``WARP_AR_BENCH`` names."""
     wanted = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(","))) or set(CASES)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)

@@ -1,4 +1,4 @@
-"""How benchmarks time and report: paired medians, one JSON line per case."""
+"""Timing and reports of benchmarks: contenders in turn, medians of paired ratios, one JSON line per case."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from warp_ar.accuracy.report import commit
 from warp_ar.device import capturing
 
 WARM_UP = 3
+"""Number of calls before the timed ones."""
 RUNS = 30
+"""Default number of timed calls."""
 
 
 def find_chromium() -> str | None:
-    """Path of a Chromium that playwright can drive; None, and a line that says so, where either is missing."""
+    """Return the path of Chromium; if Chromium or playwright is missing, print a line and return None."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None or importlib.util.find_spec("playwright") is None:
         print(json.dumps({"case": "browser", "left_out": "needs playwright and Chromium"}))
@@ -31,14 +33,14 @@ def find_chromium() -> str | None:
 
 
 def time_thread(function: Callable[[], object], device: Any) -> float:
-    """Milliseconds of one call by this thread's processor time, which other programs hardly disturb; CPU only."""
+    """Return the milliseconds of this thread's processor time in one call; other programs have little effect on it."""
     start = time.thread_time()
     function()
     return (time.thread_time() - start) * 1e3
 
 
 def time_once(function: Callable[[], object], device: Any) -> float:
-    """Milliseconds of one call, until the device has finished."""
+    """Return the elapsed milliseconds of one call, until the device has finished."""
     wp.synchronize_device(device)
     start = time.perf_counter()
     function()
@@ -49,10 +51,15 @@ def time_once(function: Callable[[], object], device: Any) -> float:
 def measure(
     functions: Mapping[str, Callable[[], object]], device: Any, runs: int = RUNS, *, one_thread: bool = False
 ) -> dict[str, list[float]]:
-    """Time contenders in turn, A B A B ..., after a warm-up; milliseconds of every run.
+    """Return the milliseconds of every run of contenders, which are timed in turn, A B A B ..., after a warm-up.
 
-    On CUDA each function is captured in a graph and the replay is timed with events: launching from Python does not
-    count. On CPU functions that work on the caller's thread alone may be timed by that thread's processor time.
+    On CUDA each function is captured as a graph and its replay is timed with events, without launches from Python.
+
+    Args:
+        functions: Contenders by name.
+        device: Device that the functions use.
+        runs: Number of timed runs of each.
+        one_thread: True to time functions on CPU that work on this thread alone by its processor time.
     """
     device = wp.get_device(device)
     if device.is_cuda:
@@ -85,12 +92,12 @@ def _time_with_events(function: Callable[[], object], device: Any) -> float:
 
 
 def paired_ratio(times: Mapping[str, list[float]], over: str, under: str) -> float:
-    """Median of the paired ratios ``over`` / ``under``."""
+    """Return the median over runs of the ratio of two contenders' times, ``over`` / ``under``."""
     return statistics.median(a / b for a, b in zip(times[over], times[under], strict=True))
 
 
 def report(case: str, milliseconds: list[float], device: Any, **more: Any) -> None:
-    """Print one JSON line: the case's median and spread, and whatever ``more`` says."""
+    """Print one JSON line with the median and the spread of a case, and further values ``more``."""
     low, median, high = np.percentile(milliseconds, [10, 50, 90])
     record = {
         "case": case,
@@ -107,10 +114,10 @@ def report(case: str, milliseconds: list[float], device: Any, **more: Any) -> No
 
 
 class KeptLines:
-    """JSON lines of a long run, printed and kept in a file, so that a later run goes on where one was ended."""
+    """JSON lines of a long run, which are printed and stored in a file, so that an interrupted run can be continued."""
 
     def __init__(self, path: Path | None) -> None:
-        """Read what is there; None keeps nothing. A last line that was cut off is left out, and made again."""
+        """Read the lines in a file; an incomplete line is removed. None: lines are only printed."""
         self._path = path
         self.records: list[dict[str, Any]] = []
         if path is None or not path.exists():
@@ -125,11 +132,11 @@ class KeptLines:
         path.write_text("".join(json.dumps(record) + "\n" for record in self.records), encoding="utf-8")
 
     def has(self, **key: Any) -> bool:
-        """Return whether a record with these values is kept."""
+        """Return True if there is a record with these values."""
         return any(all(record.get(name) == value for name, value in key.items()) for record in self.records)
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Print a record, and keep it."""
+        """Print a record and store it."""
         line = json.dumps(record)
         print(line, flush=True)
         self.records.append(json.loads(line))

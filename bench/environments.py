@@ -1,4 +1,4 @@
-"""Environments to measure filters on."""
+"""Environment maps for benchmarks and tests of filters."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import warp as wp
 from warp_ar.kernels.environment.pyramid import reduce_latlong
 
 HEIGHTS = (32, 64, 128, 256)
-"""Rows of maps that stages of the environment are measured on."""
+"""Numbers of rows of the maps with which stages of the environment are measured."""
 
 
 def random_map(height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance with a few bright texels, (rows, 2 rows, 3), and which texels are known: all but 15 %."""
+    """Return random radiance with a few bright texels, (rows, 2 rows, 3), and a mask of known texels, all but 15 %."""
     shape = (height, 2 * height)
     rng = np.random.default_rng(0)
     radiance = np.float32(rng.uniform(0, 1, (*shape, 3)) ** 4)
@@ -25,7 +25,14 @@ def random_map(height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def made_up_environment(height: int) -> np.ndarray:
-    """Dim walls, a window, a lamp of four degrees and a sun of half a degree, 512 rows or more, (rows, 2 rows, 3)."""
+    """Return an environment with dim walls, a window, a lamp of four degrees and a sun of half a degree.
+
+    Args:
+        height: Smallest number of rows; the map has at least 512.
+
+    Returns:
+        Radiance, float32 (rows, 2 rows, 3).
+    """
     fine = max(height, 512)
     theta = np.pi * (np.arange(fine)[:, None] + 0.5) / fine
     phi = (np.arange(2 * fine)[None, :] + 0.5) * np.pi / fine - np.pi
@@ -42,7 +49,7 @@ def made_up_environment(height: int) -> np.ndarray:
 
 
 def environments(height: int, device: Any) -> dict[str, wp.array]:
-    """Environments of ``height`` rows by name: the made-up environment, and those in WARP_AR_SHARED/hdri."""
+    """Return environments of ``height`` rows by name: the generated one, and those in WARP_AR_SHARED/hdri."""
     images = {"made up": made_up_environment(height)}
     for path in sorted(Path(os.environ.get("WARP_AR_SHARED", ""), "hdri").glob("*.exr")):
         images[path.stem] = OpenEXR.File(str(path)).channels()["RGB"].pixels.astype(np.float32)

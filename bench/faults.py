@@ -1,7 +1,7 @@
-"""What wrong set-ups cost: the table behind ``python -m warp_ar.doctor``, measured on simulated faults.
+"""Errors of the picture by faults of a set-up, for ``python -m warp_ar.doctor``, measured on simulated faults.
 
-The bundled desk is lit with its own numbers and with wrong ones, and both pictures are compared: mean FLIP over the
-frame. ``python -m bench.faults`` from the repository's folder writes ``warp_ar/checks/fault_errors.json``.
+The bundled desk is lit with its own numbers or frames, and with wrong ones. The error is the mean FLIP between both
+pictures. ``python -m bench.faults`` writes the table of errors.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from warp_ar.sources.sources import open_source
 
 TABLE = Path(__file__).resolve().parents[1] / "warp_ar" / "input" / "fault_errors.json"
 FRAMES = 6
-"""Frames that are lit; the last is compared."""
+"""Number of lit frames; the last one is compared."""
 
 
 def _ball(scene: Scene, **changes: Any) -> Scene:
@@ -53,7 +53,10 @@ def _scaled(gain: Any) -> Callable[[Any, int], Any]:
 
 
 def _over_ball(image: Any, paint: Callable[[Any], Any], share: float = 1.0) -> Any:
-    """The picture with the ball's disc, or the left part of it, painted; it stands still enough for six frames."""
+    """Return a picture in which the ball's disc, or a share of it from the left, is painted over.
+
+    The disc has a fixed place, because the camera hardly moves in six frames.
+    """
     mask = np.zeros(image.shape[:2], np.uint8)
     cv2.circle(mask, (186, 252), 32, 255, -1)
     mask[:, round(154 + 64 * share) :] = 0
@@ -61,7 +64,7 @@ def _over_ball(image: Any, paint: Callable[[Any], Any], share: float = 1.0) -> A
 
 
 def smoothstep() -> Any:
-    """The code that an S-shaped tone curve makes of each, (256,)."""
+    """Return an S-shaped tone curve as a table of 8-bit codes, (256,)."""
     x = np.arange(256) / 255.0
     return np.rint(255.0 * x * x * (3.0 - 2.0 * x)).astype(np.uint8)
 
@@ -104,12 +107,18 @@ PICTURES: dict[str, tuple[str, Callable[[Any, int], Any]]] = {
     "ball.hidden": ("half of it", lambda i, _: _over_ball(i, lambda p: np.full_like(p, 90), 0.5)),
 }
 NOTHING = ("marker.unseen", "marker.other", "marker.mirrored", "picture.dark", "picture.clipped", "source.empty")
-"""What leaves nothing to light."""
+"""Findings with which nothing can be lit."""
 ALSO_NOTHING = ("source.unreadable", "source.absent", "source.permission", "camera.aspect")
 
 
 def lit(scene: Scene, images: list[Any], change: Callable[[Any, int], Any] | None = None) -> Any:
-    """The last of the frames, lit."""
+    """Return the last of some frames, lit.
+
+    Args:
+        scene: Scene to light.
+        images: The frames.
+        change: Function that changes each frame, given the frame and its index.
+    """
     height, width = images[0].shape[:2]
     pipeline = warp_ar.Pipeline(scene, device="cpu", quality="low", size=(width, height))
     for k, image in enumerate(images):
@@ -131,7 +140,7 @@ def main() -> None:
         table[name] = {"fault": fault, "error": round(float(flip_map(right, picture).mean()), 4)}
         print(name, table[name], flush=True)
     for name, (fault, spoil) in PICTURES.items():
-        # What the fault does to the picture itself is not what it does to the light: only that is compared.
+        # Only the effect on virtual light is compared: the picture's own change by the fault is subtracted.
         before = spoil(images[-1], len(images) - 1).astype(float)
         added = lit(scene, images, spoil).astype(float) - before
         picture = np.clip(images[-1] + added, 0, 255).astype(np.uint8)

@@ -1,26 +1,26 @@
-"""What a quality loses against path tracing in the same light, and what both lose against the truth.
+"""Error of a quality's picture relative to path tracing in the same light, and errors of both relative to the truth.
 
     python -m bench.judge SCENE ... [--quality high,medium] [--frame N] [--samples N] [--error E] [--width N]
         [--light FILE]
 
-SCENE is a bundled scene, or the scene file of a case of truth (``scene_VERSION.toml`` beside ``VERSION/NNNN.png``). The
-frames up to N run through the pipeline; its picture of that frame, averaged down, is compared with the reference that
-follows paths in the light that the pipeline had. One JSON line per scene and quality:
+SCENE is a bundled scene, or the scene file of a case with truth (``scene_VERSION.toml`` next to ``VERSION/NNNN.png``).
+The pipeline lights the frames up to N. Its picture of frame N is compared with the reference, a path-traced picture in
+the light that the pipeline found. One JSON line per scene and quality:
 
-  nothing    root mean square difference of the camera's frame to the reference, in codes, where the latter differs
-  lost       the same of the pipeline's picture
+  nothing    root mean square difference between the camera's frame and the reference, in codes, where they differ
+  lost       root mean square difference between the pipeline's picture and the reference, in these places
   kept       lost / nothing
-  flip_*     nothing and lost as mean FLIP; flip_half between two halves of the reference's samples: its noise
-  truth_*    kept of the difference to the truth, by the pipeline and by the reference; ``truth_flip_*`` the same as
-             mean FLIP where the truth differs from the camera's frame
-  taken      samples of the reference: those that were asked for, or fewer where ``--error`` ended them
-  unsure     share of those blocks that are left out: noise of the reference may or may not clip there
+  flip_*     nothing and lost as mean FLIP; flip_half is that between two halves of the reference's samples, its noise
+  truth_*    differences of the pipeline's picture and of the reference to the truth, divided by that of the camera's
+             frame; ``truth_flip_*`` are ratios of mean FLIP, where the truth differs from the camera's frame
+  taken      number of samples of the reference, which is smaller than requested if ``--error`` was reached
+  unsure     share of blocks that are left out, because noise of the reference may or may not clip there
 
-Differences are those of means over blocks of BLOCK x BLOCK pixels in linear light, encoded. Noise of the reference is
-taken out of them: of a difference d1 to one half of its samples and d2 to the other, the mean of d1 d2 is that of the
-square of the difference to what both converge to. Pixels are clipped as the camera does, at its size: averaged down
-before, a mirrored lamp of a few pixels is brighter than the camera ever shows it. Where noise reaches clipping, clipped
-means are too dark, and such blocks do not judge.
+Differences are those of means over blocks of BLOCK x BLOCK pixels, computed in linear light and then encoded. The noise
+of the reference does not contribute to them: let d1 and d2 be the differences to the two halves of its samples. The
+mean of d1 d2 is the mean squared difference to the picture to which both halves converge. Pixels are clipped at the
+camera's size, as in the camera: if the picture were reduced first, a mirrored lamp of a few pixels would be brighter
+than the camera shows it. Where noise reaches clipping, clipped means are too dark; such blocks are left out.
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ from warp_ar.session import with_light
 Image = npt.NDArray[np.uint8]
 
 STEPS = 64
-"""After a part in so many of the samples their error is looked at."""
+"""Number of parts of the samples, after each of which their error is compared with ``--error``."""
 BLOCK = 3
-"""Pixels to each side of a block."""
+"""Side of a block in pixels."""
 CHANGED = 2.0
-"""Codes from which on a block differs from the camera's frame."""
+"""Difference in codes above which a block counts as different from the camera's frame."""
 NEAR_CLIPPING = 2.0
-"""Standard errors within which a pixel may or may not clip."""
+"""Distance from clipping in standard errors within which a pixel may or may not clip."""
 
 
 def averaged(image: Image, size: tuple[int, int]) -> Image:
-    """A picture at another size."""
+    """Return a picture averaged to another size."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def truth_of(scene: Scene, frame: int) -> Image | None:
-    """What the camera would have seen, if the scene is a case of truth that has this frame."""
+    """Return the true picture of a frame; None if the scene is not a case with truth for this frame."""
     if scene.path is None or not scene.path.stem.startswith("scene_"):
         return None
     path = scene.path.parent / scene.path.stem.removeprefix("scene_") / f"{frame:04d}.png"
@@ -70,7 +70,7 @@ def truth_of(scene: Scene, frame: int) -> Image | None:
 
 
 def blocks_of(radiance: npt.NDArray[np.float32], known: KnownFrame) -> npt.NDArray[np.float64]:
-    """Means over blocks in linear light as the camera clips it, in codes, not rounded."""
+    """Return means of clipped radiance over blocks, encoded as codes without rounding, (rows, columns, 3)."""
     table = decode_table(known.scene.camera.transfer).astype(np.float64)
     rows, columns = (side // BLOCK for side in radiance.shape[:2])
     cut = np.clip(radiance[: rows * BLOCK, : columns * BLOCK].astype(np.float64), 0.0, 1.0)
@@ -79,7 +79,7 @@ def blocks_of(radiance: npt.NDArray[np.float32], known: KnownFrame) -> npt.NDArr
 
 
 def decoded(image: Image, known: KnownFrame) -> npt.NDArray[np.float32]:
-    """Linear radiance of codes."""
+    """Return the linear radiance of a picture's codes."""
     table = decode_table(known.scene.camera.transfer)
     return np.stack([table[image[..., c], c] for c in range(3)], axis=-1)
 
@@ -87,13 +87,19 @@ def decoded(image: Image, known: KnownFrame) -> npt.NDArray[np.float32]:
 def difference(
     test: npt.NDArray[np.float64], halves: list[npt.NDArray[np.float64]], where: npt.NDArray[np.bool_]
 ) -> float:
-    """Root mean square difference to what two halves converge to, in codes."""
+    """Return the root mean square difference between a picture and the limit of two halves of samples, in codes.
+
+    Args:
+        test: Blocks of the picture.
+        halves: Blocks of each half.
+        where: Mask of the blocks to use.
+    """
     product = ((test - halves[0]) * (test - halves[-1]))[where]
     return float(np.sqrt(max(product.mean(), 0.0)))
 
 
 def unsure_blocks(halves: list[TracedPicture]) -> npt.NDArray[np.bool_]:
-    """Blocks with a pixel whose standard error reaches across clipping."""
+    """Return a mask of the blocks with a pixel that may or may not clip, by its standard error."""
     rows, columns = (side // BLOCK for side in halves[0].radiance.shape[:2])
     unsure = np.zeros(halves[0].radiance.shape[:2], bool)
     for half in halves:
@@ -103,7 +109,7 @@ def unsure_blocks(halves: list[TracedPicture]) -> npt.NDArray[np.bool_]:
 
 
 def render_half(tracer: PathTracer, samples: int, error: float | None) -> TracedPicture:
-    """One of two pictures whose mean has so many samples, or fewer where its relative standard error is ``error``."""
+    """Return one of two pictures whose mean has ``samples`` per pixel, or the relative standard error ``error``."""
     of_half = None if error is None else error * math.sqrt(2.0)
     *_, picture = tracer.render(max(samples // 2, 1), error=of_half, step=max(samples // STEPS, 16))
     return picture
@@ -112,7 +118,16 @@ def render_half(tracer: PathTracer, samples: int, error: float | None) -> Traced
 def judge(
     known: KnownFrame, truth: Image | None, width: int | None, samples: int, device: str, error: float | None = None
 ) -> dict[str, Any]:
-    """Errors of one quality on one scene, by samples until their relative standard error is ``error``."""
+    """Return the errors of one quality on one scene, by the names that the module lists.
+
+    Args:
+        known: The frame, as the pipeline lit it.
+        truth: True picture of the frame, or None.
+        width: Width of the compared pictures; None: the camera's.
+        samples: Largest number of samples per pixel.
+        device: Device of the path tracer.
+        error: Relative standard error at which sampling ends earlier.
+    """
     camera = known.scene.camera
     width = camera.width if width is None else width
     size = (width, width * camera.height // camera.width)
@@ -159,12 +174,12 @@ def judge(
 
 
 def encoded(radiance: npt.NDArray[np.float32], known: KnownFrame) -> Image:
-    """Codes of linear radiance by the camera's transfer."""
+    """Return the codes of linear radiance by the camera's transfer function."""
     return encoded_by(radiance, decode_table(known.scene.camera.transfer))
 
 
 def encoded_by(radiance: npt.NDArray[np.float32], table: npt.NDArray[np.float32]) -> Image:
-    """Codes of linear radiance by a transfer's table."""
+    """Return the codes of linear radiance by a table of linear values of codes, (256, 3)."""
     edges = 0.5 * (table[:-1] + table[1:])
     codes = [np.searchsorted(edges[:, c], radiance[..., c], side="right") for c in range(3)]
     return np.stack(codes, axis=-1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Figures 1 and 3 to 9 of [DH04] from bundled clips: the paper's method to the letter beside ours and the truth.
+"""Figures 1 and 3 to 9 of [DH04] from bundled clips: the paper's own method, ours, and the truth.
 
 Figure 2 is a photograph of the mirror ball on its marker, which every bundled clip shows.
 
@@ -32,58 +32,69 @@ from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.stages.quality import PRESETS, Quality
 
 OURS = ("medium", "high")
-"""Presets that stand beside the paper's."""
+"""Presets that are compared with the paper's method."""
 GRID = 0.05
-"""Metres between the lines of figure 5's ground plane."""
+"""Distance in metres between the lines of the ground plane in figure 5."""
 FULL = 0.4
-"""Share of the brightest added light from which a pixel lies well inside the light's cone."""
+"""Share of the brightest added light above which a pixel is well inside the light's cone."""
 GAP = 6
-"""Pixels between the pictures of a sheet."""
+"""Distance in pixels between the pictures of a sheet."""
 CARD = 0.85
-"""Half the side of a printed card, in sides of its marker."""
+"""Half the side of a printed card, relative to the side of its marker."""
 BAND = 2
-"""Rows above and below a profile's that it is the mean of."""
+"""Number of rows above and below a profile's row over which it is averaged."""
 NORMALS = (24, 48)
-"""Rows and columns of orientations at which irradiance is compared."""
+"""Rows and columns of the normals at which irradiance is compared."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of linear RGB in luminance."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """What all figures are made with."""
+    """Settings of all figures."""
 
     device: str
     """``cpu`` or ``cuda:N``."""
     count: int = 12
-    """Frames that are run; the last is shown."""
+    """Largest number of frames of a case; the last is shown."""
     times: int = 1
-    """By how much frames are shrunk."""
+    """Integer factor by which frames are reduced."""
 
     def case(self, name: str) -> Case:
-        """A bundled scene, its frames ending with the true one."""
+        """Return the case of a bundled scene; its last frame is the one with a true picture."""
         return open_scene(name, self.count, self.times)
 
 
 @dataclasses.dataclass(frozen=True)
 class PaperFigure:
-    """One figure: its picture, its numbers, its plot."""
+    """Figure with its picture, its numbers and its plots."""
 
     number: int
+    """Number in the paper."""
     title: str
+    """Title."""
     text: str
-    """What it shows, and where the paper speaks of it."""
+    """Description, with the section of the paper."""
     labels: tuple[str, ...]
-    """Of the picture's columns."""
+    """Labels of the picture's columns."""
     picture: Image
+    """Sheet of pictures."""
     head: tuple[str, ...]
+    """Names of the table's columns."""
     rows: tuple[tuple[str, ...], ...]
-    """Table of numbers."""
+    """Rows of the table of numbers."""
     plots: tuple[str, ...]
-    """SVG."""
+    """Plots as SVG."""
 
 
 def sheet(columns: Sequence[Image], reference: Image | None, box: Box) -> Image:
-    """Crops side by side, and below each its FLIP to ``reference`` where that is known; one picture."""
+    """Return one picture with crops side by side and, if there is a reference, their FLIP to it below.
+
+    Args:
+        columns: Pictures.
+        reference: Picture with which they are compared, or None.
+        box: Part of the pictures to crop.
+    """
     rows = [[crop(image, box) for image in columns]]
     if reference is not None:
         errors = [error_colors(flip_map(reference, image)) for image in columns]
@@ -98,7 +109,7 @@ def sheet(columns: Sequence[Image], reference: Image | None, box: Box) -> Image:
 
 
 def halves(first: Image, second: Image, box: Box, *, above: bool) -> Image:
-    """One picture of two: ``first`` above, or on the left, ``second`` in the other half of the box."""
+    """Return ``second`` with the upper half of a box (if ``above``; else the left half) replaced by ``first``."""
     out = second.copy()
     rows, columns = box
     if above:
@@ -121,11 +132,19 @@ def _compare(
     plain: Mapping[str, str] | None = None,
     above: bool | None = None,
 ) -> PaperFigure:
-    """A picture at the paper's preset, at ours, and truly; ``plain`` turns the paper's preset into the usual way.
+    """Return a figure that compares the camera's frame, the preset ``paper``, our presets and the truth.
 
-    Times are the work of all threads, which other programs hardly disturb.
+    Times are processor time of all threads, on which other programs have little effect.
 
-    Where the paper prints the plain way and its own as halves of one picture, ``above`` says how.
+    Args:
+        context: Settings of all figures.
+        number: Number of the figure.
+        scene: Name of the bundled scene.
+        title: Title of the figure.
+        text: Description of the figure.
+        plain: Methods that turn the preset ``paper`` into the usual method, which the paper shows for comparison.
+        above: Halves of the picture that shows the usual and the paper's method: True: upper and lower; False: left and
+            right; None: the usual method is not shown.
     """
     case = context.case(scene)
     qualities = {"plain": turn(PRESETS["paper"], plain)} if plain else {}
@@ -162,13 +181,13 @@ def _compare(
 
 
 def kept_error(camera: Image, truth: Image, image: Image, region: Mask) -> float:
-    """Share of the difference between camera and truth that a picture leaves, mean over codes of a region."""
+    """Return the mean difference between a picture and the truth in a region, divided by that of the camera's frame."""
     asked = np.abs(camera.astype(float) - truth)[region].mean()
     return float(np.abs(image.astype(float) - truth)[region].mean() / max(asked, 1e-9))
 
 
 def figure_1(context: Context) -> PaperFigure:
-    """The gold teapot and the blue spotlight."""
+    """Return figure 1: a gold teapot and a blue spotlight."""
     text = (
         "A virtual teapot of gold, lit by the environment and by a blue spotlight that falls on the physical table too "
         "(sections 3 and 4)."
@@ -177,13 +196,13 @@ def figure_1(context: Context) -> PaperFigure:
 
 
 def figure_4(context: Context) -> PaperFigure:
-    """The torus."""
+    """Return figure 4: a torus."""
     text = "A torus of unpolished gold, lit by the physical environment alone (section 3.3)."
     return _compare(context, 4, "torus", "A virtual torus in the physical environment", text)
 
 
 def figure_7(context: Context) -> PaperFigure:
-    """Half the exposure."""
+    """Return figure 7: half the exposure."""
     text = (
         "A scene darkened to 50 percent (section 4.3). Left half of the second picture: brightness alone, right half: "
         "the paper's. FLIP and kept error are of pixels that clip."
@@ -193,7 +212,7 @@ def figure_7(context: Context) -> PaperFigure:
 
 
 def figure_8(context: Context) -> PaperFigure:
-    """The wire under a coincident light."""
+    """Return figure 8: a wire under a light that coincides with the physical one."""
     text = (
         "A spotlight from where the physical light comes (section 4.4). Upper half of the second picture: alpha "
         "blending, lower half: the paper's shader."
@@ -203,7 +222,7 @@ def figure_8(context: Context) -> PaperFigure:
 
 
 def figure_9(context: Context) -> PaperFigure:
-    """The wire under an opposing light."""
+    """Return figure 9: a wire under a light that opposes the physical one."""
     text = (
         "The same spotlight against the physical light (section 4.4): highlights stay white, shadows become "
         "illuminated. Upper half of the second picture: alpha blending, lower half: the paper's shader."
@@ -216,7 +235,7 @@ def figure_9(context: Context) -> PaperFigure:
 
 
 def _maps(context: Context, case: Case, quality: Quality) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return environment and irradiance at the end of a case's frames."""
+    """Return the environment map and the irradiance map, at ``NORMALS``, after a case's frames."""
     maps: dict[str, npt.NDArray[Any]] = {}
 
     def keep(pipeline: Pipeline) -> None:
@@ -224,14 +243,14 @@ def _maps(context: Context, case: Case, quality: Quality) -> tuple[npt.NDArray[A
             if name in pipeline.arrays:
                 maps[name] = pipeline.arrays[name].numpy().astype(np.float64)
 
-    # A filter that reads the environment's map keeps it in the plan; the paper's own does not.
+    # The paper's filter does not read the environment map, so the map is taken from a run with another filter.
     for shown in (turn(quality, {"irradiance": "clusters"}), quality):
         run(case, {"": shown}, context.device, keep=keep)
     return maps["environment"], cv2.resize(maps["irradiance_map"], NORMALS[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def _shown(radiance: npt.NDArray[Any], size: tuple[int, int]) -> Image:
-    """A linear map as a picture of some height and width, repeating texels."""
+    """Return a linear map as a picture of a height and width, with repeated texels."""
     codes = (np.clip(radiance, 0.0, 1.0) ** (1.0 / 2.2) * 255.0 + 0.5).astype(np.uint8)
     rows = np.arange(size[0]) * codes.shape[0] // size[0]
     columns = np.arange(size[1]) * codes.shape[1] // size[1]
@@ -239,11 +258,11 @@ def _shown(radiance: npt.NDArray[Any], size: tuple[int, int]) -> Image:
 
 
 def figure_3(context: Context) -> PaperFigure:
-    """The environment map and its filtered form."""
+    """Return figure 3: the environment map and its filtered form."""
     case = context.case("torus")
     size = (180, 360)
     found = {name: _maps(context, case, PRESETS[name]) for name in ("paper", "high")}
-    # What the filtered map of the paper's own environment should be: the cosine lobe, texel by texel.
+    # The exact result of filtering the paper's environment is the convolution with the cosine lobe.
     exact = turn(PRESETS["paper"], {"irradiance": "brute_force"})
     _, lobe = _maps(context, case, exact)
     columns = {
@@ -284,14 +303,18 @@ def figure_3(context: Context) -> PaperFigure:
 
 
 def _luminance(case: Case, image: Image) -> npt.NDArray[np.float64]:
-    """Linear luminance of a picture by the camera's curve."""
+    """Return the linear luminance of a picture by the camera's transfer function."""
     table = decode_table(case.scene.camera.transfer).astype(np.float64)
     linear = np.stack([table[image[..., k], k] for k in range(3)], -1)
     return np.asarray(linear @ _LUMINANCE)
 
 
 def _plane_points(case: Case, index: int) -> tuple[npt.NDArray[np.float64], Mask]:
-    """Where the pixels of a frame see the first proxy, (H, W, 2) metres, and whether they do."""
+    """Return the points of the first proxy, a plane, at the pixels of a frame, and a mask of the pixels that show it.
+
+    Returns:
+        x and y in metres, (H, W, 2); and the mask, (H, W).
+    """
     pose, plane = case.poses[index], case.scene.proxies[0]
     assert pose is not None
     rays = pixel_rays(case.scene.camera).astype(np.float64)
@@ -303,7 +326,10 @@ def _plane_points(case: Case, index: int) -> tuple[npt.NDArray[np.float64], Mask
 
 
 def _lit_region(case: Case, index: int) -> Mask:
-    """Pixels well inside the virtual light's cone, holes closed: its edge is no structure of the surface."""
+    """Return a mask of the pixels well inside the virtual light's cone, with holes closed.
+
+    The edge of the cone is excluded, because it would count as structure of the surface.
+    """
     gain = _luminance(case, case.truth[index]) - _luminance(case, case.frames[index].image)
     size = max(gain.shape[0] // 30, 3)
     smooth = cv2.GaussianBlur(gain, (0, 0), 0.3 * size)
@@ -312,9 +338,10 @@ def _lit_region(case: Case, index: int) -> Mask:
 
 
 def _profile_row(case: Case, index: int, region: Mask) -> tuple[int, slice]:
-    """Row of a frame, with its columns, on which structure in a region varies most: it crosses the wire.
+    """Return the row of a frame, with a range of columns, on which brightness in a region varies most.
 
-    Only what lies to the right of the printed card: the card's pattern is paint.
+    This row crosses the wire. Only pixels to the right of the printed card are used, because the card's pattern is not
+    due to light.
     """
     points, _ = _plane_points(case, index)
     card = (np.abs(points) < CARD * case.scene.marker.size).all(-1)
@@ -334,7 +361,7 @@ def _band(values: npt.NDArray[np.float64], row: int, columns: slice) -> npt.NDAr
 
 
 def figure_5(context: Context) -> PaperFigure:
-    """The physical scene and its model."""
+    """Return figure 5: the physical scene and its model."""
     case = context.case("wire_coincident")
     index = case.shown[-1]
     camera = case.frames[index].image
@@ -375,16 +402,16 @@ def figure_5(context: Context) -> PaperFigure:
 
 
 def _structure(values: npt.NDArray[np.float64]) -> float:
-    """RMS of relative deviations from a parabola: what is left is no falloff of light."""
+    """Return the RMS of relative deviations from a parabola, which approximates the falloff of light."""
     x = np.linspace(-1.0, 1.0, len(values))
     trend = np.polyval(np.polyfit(x, values, 2), x)
     return float(np.sqrt(np.mean((values / np.maximum(trend, 1e-6) - 1.0) ** 2)))
 
 
 def figure_6(context: Context) -> PaperFigure:
-    """Intensity profiles across the wire."""
+    """Return figure 6: intensity profiles across the wire."""
     pictures: list[Image] = []
-    line: tuple[int, slice] | None = None  # both clips are of one frame: the same line crosses the same wire
+    line: tuple[int, slice] | None = None  # both clips have the same frame, so one line serves for both
     rows, plots = [], []
     for scene, where in (("wire_coincident", "coincident"), ("wire_opposing", "opposing")):
         case = context.case(scene)
@@ -434,7 +461,7 @@ def figure_6(context: Context) -> PaperFigure:
 
 
 def _detail(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """A profile less its trend."""
+    """Return a profile minus its trend, a parabola."""
     x = np.linspace(-1.0, 1.0, len(values))
     return np.asarray(values - np.polyval(np.polyfit(x, values, 2), x))
 
@@ -451,7 +478,7 @@ FIGURES: Mapping[int, Callable[[Context], PaperFigure]] = MappingProxyType(
         9: figure_9,
     }
 )
-"""By number."""
+"""Functions that make the figures, by number."""
 
 
 # -------------------------------------------------------------------------------------------------------- open readings
@@ -459,13 +486,16 @@ FIGURES: Mapping[int, Callable[[Context], PaperFigure]] = MappingProxyType(
 
 @dataclasses.dataclass(frozen=True)
 class Reading:
-    """One way to take what the paper leaves open."""
+    """One interpretation of a statement that the paper leaves open."""
 
     section: str
+    """Section of the paper."""
     question: str
+    """Quantity that is left open."""
     answer: str
+    """Interpretation."""
     methods: Mapping[str, str]
-    """What it changes of the preset ``paper``."""
+    """Methods that differ from those of the preset ``paper``."""
     video: bool = False
     """True if everything is computed in video values, as if the camera were linear."""
 
@@ -485,15 +515,15 @@ READINGS: tuple[Reading, ...] = (
     Reading("4.3", "the factor", "s + (1 - s) clamp(2 a - 1, 0, 1) (taken)", {}),
     Reading("4.3", "the factor", "s + (1 - s) a", {"expose": "paper_mean"}),
 )
-"""What ``docs/paper.md`` compares."""
+"""Interpretations that ``docs/paper.md`` compares."""
 READING_SCENES = ("desk", "torus", "wire_coincident", "wire_opposing", "darken")
-"""Scenes on which it does."""
+"""Scenes on which ``docs/paper.md`` compares them."""
 
 
 def compare_readings(
     context: Context, scenes: Sequence[str] = READING_SCENES
 ) -> list[tuple[Reading, dict[str, float]]]:
-    """FLIP to the truth of the preset ``paper``, by scene, for every reading that matters there."""
+    """Return each interpretation with its FLIP to the truth by scene, without the scenes that it does not affect."""
     found: list[tuple[Reading, dict[str, float]]] = [(reading, {}) for reading in READINGS]
     for scene in scenes:
         case = context.case(scene)
@@ -509,7 +539,7 @@ def compare_readings(
 
 
 def _matters(reading: Reading, case: Case) -> bool:
-    """Return whether a case can tell a reading from others."""
+    """Return True if an interpretation affects the picture of a case."""
     if reading.section == "4.3":
         return case.darker
     return bool(case.scene.objects if reading.section == "3.1" else case.scene.lights) and not case.darker

@@ -1,4 +1,4 @@
-"""Random tables whose light is known, and scenes that tell the program more or less of the truth about them."""
+"""Random tables with known light, each with a scene file that describes them more or less correctly."""
 
 from __future__ import annotations
 
@@ -18,31 +18,33 @@ Array = NDArray[np.float64]
 SIZE = (480, 360)
 """Width and height of pictures."""
 SUPERSAMPLING = 2
+"""Number of rays along each side of a pixel."""
 MARKER = 0.08
 """Side of the marker's black square, metres."""
 NAMES = ("city", "courtyard", "forest", "interior", "night", "studio", "sunrise", "sunset")
-"""Environments of WARP_AR_SHARED/hdri; without them a made-up one is turned."""
+"""Names of environments in WARP_AR_SHARED/hdri; a generated one replaces those that are missing."""
 
 
 @dataclasses.dataclass
 class Setup:
-    """A picture, its light, and what the program is told."""
+    """Picture of a table, its true light, and the scene file for the program."""
 
     image: NDArray[np.uint8]
-    """(height, width, 3)."""
+    """Picture, RGB (height, width, 3)."""
     truth: Array
-    """Radiance that arrives at the ball's centre, camera values, (64, 128, 3)."""
+    """True radiance that arrives at the ball's centre, in units of the camera's clipping, (64, 128, 3)."""
     scene: str
-    """Scene file."""
+    """Text of the scene file."""
     rotation: Array
-    """``camera_from_world``, (3, 3)."""
+    """Rotation of ``camera_from_world``, (3, 3)."""
     translation: Array
+    """Translation of ``camera_from_world``, metres, (3,)."""
     about: dict[str, Any]
-    """What is right and wrong with it."""
+    """Properties of the table and errors of the scene file."""
 
 
 def load_environment(rng: np.random.Generator) -> tuple[str, NDArray[np.float32]]:
-    """One of the environments, turned."""
+    """Return the name and the radiance of a random environment, rotated about the vertical by a random angle."""
     name, folder = str(rng.choice(NAMES)), Path(os.environ.get("WARP_AR_SHARED", ""), "hdri")
     image = made_up_environment(FINE[0])
     if (folder / f"{name}.exr").is_file():
@@ -56,7 +58,7 @@ def load_environment(rng: np.random.Generator) -> tuple[str, NDArray[np.float32]
 
 
 def make_setup(seed: int) -> Setup:
-    """The set-up of a number."""
+    """Return the set-up for a seed."""
     rng = np.random.default_rng(seed)
     name, environment = load_environment(rng)
     radius = float(rng.choice([0.03, 0.04, 0.05, 0.075]))
@@ -92,7 +94,10 @@ def make_setup(seed: int) -> Setup:
 
 
 def _choose_camera(rng: np.random.Generator, ball: Array, radius: float) -> tuple[Array, Array, float]:
-    """Where it stands, ``camera_from_world`` and its focal length: the ball is 30 to 300 pixels of 640 across."""
+    """Return the camera's position, its rotation ``camera_from_world``, and its focal length in pixels.
+
+    The ball is 30 to 300 pixels wide in a picture of 640.
+    """
     elevation, azimuth = np.radians(rng.uniform(12.0, 60.0)), rng.uniform(-0.7, 0.7) - np.pi / 2
     target = ball * rng.uniform(0.3, 0.9)
     target[2] = 0.02
@@ -106,7 +111,7 @@ def _choose_camera(rng: np.random.Generator, ball: Array, radius: float) -> tupl
 
 
 def _choose_texture(rng: np.random.Generator, size: int = 512) -> tuple[NDArray[np.float32], float]:
-    """Reflectance of a table, and the standard deviation of its logarithm."""
+    """Return the reflectance of a table, (size, size, 3), and the standard deviation of its logarithm."""
     amplitude = float(rng.choice([0.0, 0.05, 0.15, 0.35]))
     noise = np.zeros((size, size), np.float32)
     for scale in (4, 16, 64):
@@ -117,7 +122,7 @@ def _choose_texture(rng: np.random.Generator, size: int = 512) -> tuple[NDArray[
 
 
 def _choose_card(rng: np.random.Generator, kind: str) -> Card | None:
-    """As white as the program is told, grey, tinted, or none."""
+    """Return a card of a kind: ``true`` (as white as the scene states), ``grey``, ``tinted``, or ``none``."""
     if kind == "none":
         return None
     pattern = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 0, 120)
@@ -133,7 +138,10 @@ def _choose_card(rng: np.random.Generator, kind: str) -> Card | None:
 def _choose_blocks(
     rng: np.random.Generator, ball: Array, radius: float, eye: Array, half: Array
 ) -> tuple[list[Block], bool]:
-    """Boxes, some of them clutter, none before ball or card; and whether a wall stands behind the ball."""
+    """Return boxes, some of which are not modelled, and True if there is a wall behind the ball.
+
+    No box is in front of the ball or the card.
+    """
     blocks: list[Block] = []
     toward = (eye - ball)[:2] / np.linalg.norm((eye - ball)[:2])
     side = np.array([-toward[1], toward[0]])
@@ -167,7 +175,7 @@ def _choose_blocks(
 def _choose_bulbs(
     rng: np.random.Generator, environment: NDArray[np.float32], ball: Array, eye: Array, wall: bool
 ) -> list[Bulb]:
-    """Lamps, a third of them in the ball's unseen cone; none in a wall."""
+    """Return lamps, of which about a third are in directions that the ball does not show; none is behind a wall."""
     area = latlong_directions(*FINE)[1]
     mean = float((environment * area[..., None]).sum((0, 1)).mean() / (4.0 * np.pi))
     bulbs = []
@@ -188,7 +196,7 @@ def _choose_bulbs(
 def _photograph(
     rng: np.random.Generator, world: World, eye: Array, rotation: Array, focal: float
 ) -> tuple[NDArray[np.uint8], float, dict[str, Any]]:
-    """The picture, its exposure, and what is wrong with the camera."""
+    """Return a picture of the table, its exposure, and the properties of the camera."""
     (width, height), many = SIZE, SUPERSAMPLING
     u, v = np.meshgrid((np.arange(width * many) + 0.5) / many - 0.5, (np.arange(height * many) + 0.5) / many - 0.5)
     d = np.stack([(u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, np.ones_like(u)], -1).reshape(-1, 3)
@@ -213,7 +221,13 @@ def _photograph(
 
 
 def _encode(x: Array, response: str, value: float) -> Array:
-    """Encoded values of linear ones, both 0 to 1."""
+    """Return the encoded values of linear ones, both 0 to 1.
+
+    Args:
+        x: Linear values.
+        response: ``srgb``, ``gamma`` or ``curve`` (an S-shaped curve after sRGB).
+        value: Exponent of ``gamma``, or steepness of ``curve``.
+    """
     if response == "gamma":
         return np.asarray(x ** (1.0 / value))
     y = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1.0 / 2.4) - 0.055)
@@ -224,7 +238,7 @@ def _encode(x: Array, response: str, value: float) -> Array:
 
 
 def _describe(focal: float, ball: Array, radius: float, reflectance: float, half: Array, blocks: list[Block]) -> str:
-    """The scene file that the program is given."""
+    """Return the text of the scene file, with the numbers that it states."""
     width, height = SIZE
     parts = [
         f"schema = 1\n[camera]\nwidth = {width}\nheight = {height}\nfx = {focal}\nfy = {focal}\n"

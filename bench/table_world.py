@@ -1,9 +1,9 @@
-"""A table with a mirror ball, boxes, lamps and an environment, rendered by NumPy alone: nothing of the program is used.
+"""Renderer of a table with a mirror ball, boxes, lamps and an environment, in NumPy alone, independent of the program.
 
-The light is that of an environment at infinity and of small spheres. Surfaces are Lambertian and receive what
-``World.irradiance`` gathers: the environment from 2,048 directions, hidden by the ball and by boxes, what the ball
-throws, what table and boxes send by ``BOUNCES`` of light, each as they are lit where they are seen, and every lamp. A
-picture is traced with one reflection in the ball.
+The light comes from an environment at infinity and from small spheres. Surfaces are Lambertian. ``World.irradiance``
+sums the light that they receive: from lamps, and from 2,048 directions, in each of which the environment, the table, a
+box, or a reflection in the ball is visible. Table and boxes are lit by ``BOUNCES`` interreflections. A picture is
+traced with one reflection in the ball.
 """
 
 from __future__ import annotations
@@ -16,17 +16,20 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 COARSE = (32, 64)
-"""Rows and columns of the directions from which surfaces are lit."""
+"""Rows and columns of the map of directions from which surfaces are lit."""
 FINE = (256, 512)
-"""The same of the environment that is seen."""
+"""Rows and columns of the environment map that pictures show."""
 BOUNCES = 2
-"""Times that light is handed on between surfaces."""
+"""Number of interreflections between surfaces."""
 REMAP_MOST = 30_000
-"""Rows that ``cv2.remap`` takes at a time."""
+"""Largest number of rows that ``cv2.remap`` accepts."""
 
 
 def latlong_directions(rows: int, columns: int) -> tuple[Array, Array]:
-    """Unit directions (rows, columns, 3) and solid angles (rows, columns) of texels; row 0 is +z, the middle +x."""
+    """Return unit directions (rows, columns, 3) and solid angles (rows, columns) of a latlong map's texels.
+
+    Row 0 is near +z; the middle columns are toward +x.
+    """
     theta = (np.arange(rows) + 0.5) / rows * np.pi
     phi = ((np.arange(columns) + 0.5) / columns * 2.0 - 1.0) * np.pi
     theta, phi = np.meshgrid(theta, phi, indexing="ij")
@@ -35,7 +38,7 @@ def latlong_directions(rows: int, columns: int) -> tuple[Array, Array]:
 
 
 def sample(image: NDArray[np.float32], x: Array, y: Array, border: int = cv2.BORDER_REPLICATE) -> Array:
-    """Bilinear samples at pixel coordinates (k,), (k, channels)."""
+    """Return bilinear samples of an image at pixel coordinates (k,), (k, channels)."""
     at = [np.asarray(v, np.float32).reshape(-1, 1) for v in (x, y)]
     parts = [
         cv2.remap(image, at[0][i : i + REMAP_MOST], at[1][i : i + REMAP_MOST], cv2.INTER_LINEAR, borderMode=border)
@@ -45,7 +48,7 @@ def sample(image: NDArray[np.float32], x: Array, y: Array, border: int = cv2.BOR
 
 
 def look_up(environment: NDArray[np.float32], d: Array) -> Array:
-    """Radiance from directions (k, 3)."""
+    """Return the radiance of an environment from directions (k, 3), (k, 3)."""
     rows, columns = environment.shape[:2]
     y = np.clip(np.arccos(np.clip(d[:, 2], -1.0, 1.0)) / np.pi * rows - 0.5, 0.0, rows - 1.0)
     x = (np.arctan2(d[:, 1], d[:, 0]) / np.pi + 1.0) / 2.0 * columns + 0.5
@@ -53,7 +56,7 @@ def look_up(environment: NDArray[np.float32], d: Array) -> Array:
 
 
 def sphere_distance(center: Array, radius: float, origin: Array, d: Array) -> Array:
-    """Distance along unit directions to a sphere met from outside; infinite where it is not."""
+    """Return the distance along rays with unit directions d to a sphere that they enter; infinite if they miss it."""
     to_center = center - origin
     along = (to_center * d).sum(-1)
     within = radius**2 - (to_center**2).sum(-1) + along**2
@@ -63,15 +66,18 @@ def sphere_distance(center: Array, radius: float, origin: Array, d: Array) -> Ar
 
 @dataclasses.dataclass
 class Block:
-    """A box that stands on the table."""
+    """Box that stands on the table."""
 
     at: Array
+    """Centre, metres, (3,)."""
     size: Array
+    """Sides, metres, (3,)."""
     turn: float
-    """Degrees about the upright axis."""
+    """Rotation about the vertical, degrees."""
     color: Array
+    """Reflectance, RGB."""
     modelled: bool
-    """True if the program is told of it."""
+    """True if the scene file contains the box."""
 
     @property
     def rotation(self) -> Array:
@@ -80,11 +86,11 @@ class Block:
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def distance(self, origin: Array, d: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Distance along directions, infinite where it is missed, and which of six faces is hit."""
+        """Return the distance along rays to the box, infinite if they miss it, and the index of the face they hit."""
         o, d = (origin - self.at) @ self.rotation, d @ self.rotation
         inverse = 1.0 / np.where(np.abs(d) < 1e-9, 1e-9, d)
         a, b = (-self.size / 2 - o) * inverse, (self.size / 2 - o) * inverse
-        # Reductions over an axis of three are several times as slow as its three slices.
+        # NumPy reduces over an axis of length three several times as slowly as over three separate arrays.
         low, high = (tuple(np.moveaxis(both(a, b), -1, 0)) for both in (np.minimum, np.maximum))
         enters = np.maximum(np.maximum(low[0], low[1]), low[2])
         leaves = np.minimum(np.minimum(high[0], high[1]), high[2])
@@ -96,25 +102,32 @@ class Block:
 
 @dataclasses.dataclass
 class Bulb:
-    """A sphere that shines."""
+    """Lamp: a sphere that emits light."""
 
     at: Array
+    """Centre, metres, (3,)."""
     radius: float
+    """Radius, metres."""
     radiance: Array
+    """Radiance, RGB."""
 
 
 @dataclasses.dataclass
 class Card:
-    """A printed marker at the origin."""
+    """Printed marker at the origin."""
 
     print: NDArray[np.uint8]
+    """Picture of the print; 0 is ink."""
     half: float
+    """Half the side of the card, metres."""
     white: Array
+    """Reflectance of the paper, RGB."""
     ink: float
+    """Reflectance of ink."""
 
 
 class World:
-    """The table is z = 0; radiance is in the environment's own units."""
+    """Table at z = 0 with all objects on it and its environment; radiance is in the environment's units."""
 
     def __init__(
         self,
@@ -125,15 +138,15 @@ class World:
         table: tuple[NDArray[np.float32], Array],
         card: Card | None,
     ) -> None:
-        """Work out what light surfaces receive.
+        """Compute the light that surfaces receive.
 
         Args:
-            environment: ``FINE`` latlong radiance.
+            environment: Latlong radiance, of the size ``FINE``.
             ball: Centre, radius and reflectance.
             blocks: Boxes.
             bulbs: Lamps.
-            table: Its reflectance, a square picture, and half its size in metres, (2,).
-            card: What is printed on it.
+            table: Reflectance of the table, a square picture, and half its sides in metres, (2,).
+            card: Card on the table, or None.
         """
         self.environment, self.blocks, self.bulbs, self.card = environment, blocks, bulbs, card
         self.center, self.radius, self.reflectance = ball
@@ -164,7 +177,7 @@ class World:
             self.table_light = table
 
     def _choose_lines(self) -> None:
-        """Lines on which the table's light is known: close to each other around the ball."""
+        """Choose the lines of a grid on which the table's light is computed; they are closer around the ball."""
         far = np.geomspace(0.012, 2.0, 16)
         near, even = np.concatenate([-far[::-1], [0.0], far]), np.arange(-0.4, 0.41, 0.05)
         self.lines = [
@@ -172,14 +185,14 @@ class World:
         ]
 
     def _light_table(self) -> NDArray[np.float32]:
-        """Irradiance of the table on its lines."""
+        """Return the irradiance of the table at the points of its grid."""
         grid = np.stack(np.meshgrid(*self.lines, indexing="xy"), -1)
         points = np.concatenate([grid, np.full((*grid.shape[:2], 1), 1e-4)], -1)
         lit = self.irradiance(points.reshape(-1, 3), np.array([0.0, 0.0, 1.0]))
         return lit.reshape(*grid.shape[:2], 3).astype(np.float32)
 
     def _light_face(self, block: Block, face: int) -> NDArray[np.float32]:
-        """Irradiance of 5 x 5 points of a block's face."""
+        """Return the irradiance at 5 x 5 points of a block's face."""
         axis, sign = face // 2, 1.0 if face % 2 else -1.0
         u, v = (axis + 1) % 3, (axis + 2) % 3
         steps = (np.arange(5) + 0.5) / 5 - 0.5
@@ -191,7 +204,7 @@ class World:
         return lit.reshape(5, 5, 3).astype(np.float32)
 
     def irradiance(self, points: Array, normal: Array) -> Array:
-        """Irradiance at points that face one way, (k, 3)."""
+        """Return the irradiance at points (k, 3) with a common normal, (k, 3)."""
         cosine = self.direction @ normal
         use = cosine > 0.0
         weight = (self.area * cosine)[use]
@@ -213,7 +226,13 @@ class World:
         return result
 
     def _arriving(self, origin: Array, d: Array, use: NDArray[np.bool_]) -> Array:
-        """Radiance of the coarse directions ``use`` at points, (points, directions, 3)."""
+        """Return the radiance that arrives at points from the coarse directions ``use``, (points, directions, 3).
+
+        Args:
+            origin: Points, (points, 1, 3).
+            d: Unit directions, (1, directions, 3).
+            use: Mask of these directions among all coarse ones.
+        """
         shape = (len(origin), d.shape[1])
         radiance = np.broadcast_to(self.radiance[use], (*shape, 3)).copy()
         nearest = np.full(shape, np.inf)
@@ -242,7 +261,7 @@ class World:
         return radiance
 
     def trace(self, origin: Array, d: Array, *, ball: bool = True) -> Array:
-        """Radiance along unit directions (k, 3)."""
+        """Return the radiance along rays with unit directions d (k, 3), (k, 3); the ball is visible if ``ball``."""
         origin = np.broadcast_to(origin, d.shape)
         radiance, nearest = look_up(self.environment, d), np.full(len(d), np.inf)
         for bulb in self.bulbs:
@@ -266,7 +285,7 @@ class World:
         return radiance
 
     def _trace_table(self, origin: Array, d: Array, radiance: Array, nearest: Array) -> None:
-        """Put the table into what rays meet."""
+        """Update radiance and distance of the rays that meet the table first."""
         down = d[:, 2] < -1e-6
         t = np.where(down, -origin[:, 2] / np.where(down, d[:, 2], -1.0), np.inf)
         at = origin + np.where(np.isfinite(t), t, 0.0)[:, None] * d
@@ -277,12 +296,12 @@ class World:
         nearest[on] = t[on]
 
     def _table_radiance(self, at: Array) -> Array:
-        """What points on the table send, (k, 3)."""
+        """Return the radiance of points on the table, (k, 3)."""
         x, y = (np.interp(at[:, k], self.lines[k], np.arange(len(self.lines[k]))) for k in (0, 1))
         return np.asarray(sample(self.table_light, x, y) * self._table_reflectance(at) / np.pi)
 
     def _table_reflectance(self, at: Array) -> Array:
-        """Of points on the table, the card on it, (k, 3)."""
+        """Return the reflectance of points on the table or on its card, (k, 3)."""
         size = len(self.texture)
         place = (at[:, :2] / (2.0 * self.half) + 0.5) * size
         result = sample(self.texture, place[:, 0], place[:, 1], cv2.BORDER_REFLECT)
@@ -298,13 +317,13 @@ class World:
 
 
 def _face_radiance(block: Block, faces: list[NDArray[np.float32]], at: Array, face: NDArray[np.int64]) -> Array:
-    """What points on a block's faces send, (k, 3).
+    """Return the radiance of points on a block's faces, (k, 3).
 
     Args:
         block: The box.
-        faces: Irradiance of its six, 5 x 5 points each.
-        at: Where, (k, 3).
-        face: On which face, (k,).
+        faces: Irradiance at 5 x 5 points of each of its six faces.
+        at: The points, (k, 3).
+        face: Index of each point's face, (k,).
     """
     place = 5.0 * ((at - block.at) @ block.rotation / block.size + 0.5) - 0.5
     result = np.zeros((len(at), 3))

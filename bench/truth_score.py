@@ -1,17 +1,22 @@
-"""Cases of truth by path tracing in their true light: what is left when light, pose and transport are right.
+"""Error of path tracing on cases with truth: the error that remains if light, pose and transport are right.
 
     python -m bench.truth_score CASE ... [--versions object,light,both] [--frames 0,6,11] [--samples N] [--error E]
         [--places] [--device D]
 
-CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scene file of each version. The pictures
-have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
-JSON line per case and version; ``kept`` is the mean FLIP to the truth where the truth differs from the camera's frame,
-over that of the frame itself. Half of the samples have another seed, which tells the noise: ``kept_half`` is the same
-by one half, ``noise`` the difference between both, ``error`` the relative standard error where the picture changes.
-Samples go to pixels within MARGIN of those that count. With ``--error E`` they end earlier where ``error`` is E;
-``taken`` is how many there were. With ``--keep FILE`` lines of single frames are kept there, and what it holds at these
-samples is not rendered again. With ``--places`` the distances of the light's emitters are looked for in the frame
-(``accuracy/light_places.py``); without it all light is distant, as it was where lamps stand near.
+CASE is a folder with ``case.json``, ``camera``, ``env``, and a folder and a scene file of each version. Pictures have
+the size of the frames, because the truth was clipped at that size: a clipped highlight becomes dimmer if the picture is
+reduced. One JSON line per case and version:
+
+  nothing    mean FLIP between the camera's frame and the truth, where they differ
+  kept       mean FLIP between the path-traced picture and the truth in these places, divided by ``nothing``
+  kept_half  ``kept`` of a picture with half of the samples; the other half has another seed
+  noise      mean FLIP between the pictures of both halves, divided by ``nothing``
+  error      relative standard error of the picture, where virtual content changes it
+  taken      number of samples, which is smaller than requested if ``--error E`` was reached
+
+Only pixels within MARGIN of the compared ones are sampled. With ``--keep FILE``, the lines of single frames are stored
+in a file, and frames in it are not rendered again. With ``--places``, the distances of the light's emitters are
+estimated from the frame (``accuracy/light_places.py``); otherwise all light is distant, even that of near lamps.
 """
 
 from __future__ import annotations
@@ -38,19 +43,24 @@ from warp_ar.scene import Pose, load_scene
 Image = npt.NDArray[np.uint8]
 
 MARGIN = 16
-"""Pixels around the region that counts: as far as FLIP filters, and some."""
+"""Distance in pixels around the compared region within which pixels are sampled; FLIP's filters reach less far."""
 OVERHEAD = (0.0, -1e4)
-"""Of a ray on the camera's plane at a distance of 1, y downward."""
+"""Intersection (x, y down) of a ray that goes straight up with the camera's plane z = 1."""
 
 
 def read_image(path: Path) -> Image | None:
-    """An RGB picture, if it is there."""
+    """Return an RGB picture; None if it does not exist."""
     image = cv2.imread(str(path))
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
 
 
 def leave_alone(tracer: PathTracer, pixels: npt.NDArray[np.bool_]) -> None:
-    """Let pixels keep the frame, at the cost of one ray: theirs go over the camera's head, and meet nothing there."""
+    """Let some pixels keep the frame: their rays go straight up from the camera, where they meet nothing.
+
+    Args:
+        tracer: The path tracer.
+        pixels: Mask of the pixels, (H, W).
+    """
     tracer.prepare()
     picture = tracer._local.picture
     rays = picture.rays.numpy()
@@ -68,7 +78,17 @@ def score(
     *,
     places: bool = False,
 ) -> dict[str, float] | None:
-    """Errors of one frame by so many samples, or fewer for a standard error of ``error``; None: no such frame."""
+    """Return the errors of one frame, by the names that the module lists; None if there is no such frame.
+
+    Args:
+        case: Folder of the case.
+        version: Version of the case.
+        frame: Index of the frame.
+        samples: Largest number of samples per pixel.
+        device: Device of the path tracer.
+        error: Relative standard error at which sampling ends earlier.
+        places: True to estimate the distances of emitters.
+    """
     truth = read_image(case / version / f"{frame:04d}.png")
     camera = read_image(case / "camera" / f"{frame:04d}.png")
     if truth is None or camera is None:
