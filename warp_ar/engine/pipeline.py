@@ -316,7 +316,7 @@ class Pipeline(Closing):
             quality: A preset's name or a ``Quality``; None keeps the current one.
 
         Raises:
-            UsageError: ``scene`` is no scene, or the quality is unknown or cannot run here; nothing has changed.
+            UsageError: ``scene`` is not a Scene, or the quality is unknown or cannot run here; nothing has changed.
             SceneError: The scene's camera does not fit the frames, or a file that it names cannot be used.
         """
         scene = self._check_next(self.scene if scene is None else scene)

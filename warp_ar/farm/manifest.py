@@ -160,7 +160,7 @@ def _kept(path: Path) -> bytes | None:
     """Return the content of one of a run's own files; None if it does not exist.
 
     Raises:
-        RunError: It is no regular file, is too large, or cannot be read.
+        RunError: The file is not regular, is too large, or cannot be read.
     """
     try:
         return None if kind_of(path) == "nothing" else read_bytes(path, "run_bytes", RunError)
