@@ -30,8 +30,6 @@ MAX_MESSAGE: Final = (1 << 20) + 64
 """Largest message from a page in bytes: a JPEG of 1920x1080 at quality 0.85 takes half of it."""
 MOST_BYTES: Final = 1 << 26
 """Largest dropped file, bytes: 64 MB."""
-SMALLEST_CAMERA: Final = (64, 48)
-LARGEST_CAMERA: Final = (1920, 1080)
 
 EFFECTS: Final = ("objects", "lights", "environment", "receiver", "exposure", "relief", "environment_shadow")
 """Effects that the page can switch off."""
@@ -39,15 +37,6 @@ CONVERGING: Final = ("traced", "difference")
 """Comparisons of a held frame: with the reference, or with the difference to the reference in false colours."""
 PARTS: Final = ("object", "light", "proxy", "exposure", "marker")
 """Parts of a scene that the page can edit."""
-ANIMATED: Final = ("animation", "speed", "loop", "paused")
-"""Values of an object's animation that the page can change."""
-LISTED: Final = ("object", "light", "proxy")
-"""Parts of which a scene may have several."""
-OUTLINES: Final = ("plane", "wall", "box")
-"""Kinds of proxies that can be outlined by four points of the picture."""
-SETUP_STEPS: Final = ("check", "ball", "light", "response")
-"""Steps of the set-up: ``check`` everything, measure the ``ball`` or the camera's ``response``, or estimate the
-``light`` from the printed card."""
 
 
 class ProtocolError(WarpArError, ValueError):
@@ -135,6 +124,7 @@ def _points(value: Any) -> tuple[tuple[float, float], ...]:
 
 
 _INDEX = _number(0, 63, int)
+_ITEM = {"part": _choice("object", "light", "proxy"), "index": _INDEX}
 _NAME = {"name": _name}
 _ON = {"on": _flag}
 
@@ -148,14 +138,18 @@ _MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
     # Sets a key of a part of the scene, as in a scene file.
     "set": {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value},
     # Changes the playback of an object's animation; a flag is 0 or 1.
-    "animate": {"index": _INDEX, "key": _choice(*ANIMATED), "value": _number(-1.0, 1e3)},
-    "add": {"part": _choice(*LISTED), "kind": _name},
+    "animate": {
+        "index": _INDEX,
+        "key": _choice("animation", "speed", "loop", "paused"),
+        "value": _number(-1.0, 1e3),
+    },
+    "add": {"part": _choice("object", "light"), "kind": _name},
     # Adds a copy of an object, light or proxy near the original.
-    "duplicate": {"part": _choice(*LISTED), "index": _INDEX},
+    "duplicate": _ITEM,
     # Moves an object vertically until its lowest point is on the desk.
     "snap": {"index": _INDEX},
-    "remove": {"part": _choice(*LISTED), "index": _INDEX},
-    "show": {"part": _choice(*LISTED), "index": _INDEX, **_ON},
+    "remove": _ITEM,
+    "show": {**_ITEM, **_ON},
     "effect": {"name": _choice(*EFFECTS), **_ON},
     "quality": _NAME,
     # Chooses the method of one stage; an empty name restores the preset's method.
@@ -168,18 +162,16 @@ _MESSAGES: Final[Mapping[str, Mapping[str, Check]]] = {
     "play": _ON,
     "scene": _NAME,
     # Adds a proxy for the part of the desk that four points of the picture outline, pixels.
-    "outline": {"kind": _choice(*OUTLINES), "points": _points},
+    "outline": {"kind": _choice("plane", "wall", "box"), "points": _points},
     # Makes the printed card the marker. Both are in metres: radius of the ball, measured length of the 100 mm rulers.
     "card": {"radius": _number(0.0, 10.0), "ruler": _number(0.0, 10.0)},
-    "setup": {"step": _choice(*SETUP_STEPS)},
+    # Checks everything, measures the ball or the camera's response, or estimates the light from the printed card.
+    "setup": {"step": _choice("check", "ball", "light", "response")},
     "undo": {},
     "redo": {},
     "reset": {},
     # Makes the camera of the page's browser the source; binary messages with its pictures follow.
-    "camera": {
-        "width": _number(SMALLEST_CAMERA[0], LARGEST_CAMERA[0], int),
-        "height": _number(SMALLEST_CAMERA[1], LARGEST_CAMERA[0], int),
-    },
+    "camera": {"width": _number(64, 1920, int), "height": _number(48, 1920, int)},
     "no_camera": {},
     # Starts to collect views of the printed board, stops without a result, or computes the camera from the views.
     "calibrate": {"step": _choice("start", "stop", "finish")},
