@@ -99,7 +99,7 @@ def test_a_signal_right_after_a_file_is_created_leaves_nothing(
     with pytest.raises(Terminated):
         write_whole(tmp_path / "run.json", b"{}")
     with pytest.raises(Terminated):
-        WholeFragments(tmp_path / "clip.mp4", boxes=True)
+        WholeFragments(tmp_path / "clip.mp4")
     monkeypatch.undo()
     assert list(tmp_path.iterdir()) == []
 

@@ -51,8 +51,10 @@ _FULL_CHROMA = "yuv444p10le"
 _WORDS = {"libx264": "H.264", "libx265": "H.265"}
 
 
-_MEDIA = {True: b"mdat", False: b"\x1f\x43\xb6\x75"}
+_MEDIA = (b"mdat", b"\x1f\x43\xb6\x75")
 """First bytes of picture data: a box of MP4, a cluster of Matroska."""
+_BUFFER = 1 << 27
+"""Bytes that FFmpeg collects before it writes; a fragment that is not larger is written at once."""
 _SEEK_SIZE = 0x10000
 """FFmpeg's value of ``whence`` that asks for the file's size."""
 
@@ -158,9 +160,10 @@ class VideoSink(ThreadedSink):
         flags = "hybrid_fragmented+frag_keyframe+empty_moov+default_base_moof+negative_cts_offsets"
         fragments = {"movflags": flags} if movie else {"cluster_time_limit": str(round(1000 * FRAGMENT_SECONDS))}
         group = max(1, round(FRAGMENT_SECONDS * self._fps))
-        self._file = WholeFragments(self._path, boxes=movie)
+        self._file = WholeFragments(self._path)
         options = {**fragments, "flush_packets": "1"}
-        self._container = av.open(self._file, "w", format=_FORMATS[self._path.suffix.lower()], options=options)
+        kind = _FORMATS[self._path.suffix.lower()]
+        self._container = av.open(self._file, "w", format=kind, options=options, buffer_size=_BUFFER)
         self._container.metadata["comment"] = PROGRAM
         encoding, options = self._encoding, {"g": str(group), **self._encoding.options}
         self._stream = self._container.add_stream(encoding.encoder, rate=self._rate, options=options)
@@ -292,22 +295,17 @@ class WholeFragments:
     """File object through which FFmpeg writes a video.
 
     The file is written under a temporary name and gets its final name with its first fragment, so that an existing file
-    stays until then. Boxes of MP4 and MOV (a fragment is ``moof`` and ``mdat``) are buffered until complete and written
-    at once; a box that does not fit on the disk is removed again. Matroska, whose readers accept truncated files, is
-    written directly. Errors are stored in ``error``, because FFmpeg continues regardless.
+    stays until then. FFmpeg hands over whole fragments; one that does not fit on the disk is removed again. Errors are
+    stored in ``error``, because FFmpeg continues regardless.
     """
 
-    def __init__(self, path: pathlib.Path, *, boxes: bool) -> None:
-        """Create the file.
-
-        Args:
-            path: Final path of the file.
-            boxes: True for formats made of boxes, such as MP4 and MOV.
+    def __init__(self, path: pathlib.Path) -> None:
+        """Create the file; ``path`` is its final path.
 
         Raises:
             OSError: The file cannot be created.
         """
-        self._path, self._boxes = pathlib.Path(os.path.realpath(path)), boxes
+        self._path = pathlib.Path(os.path.realpath(path))
         part = name_aside(self._path)
         self._part: pathlib.Path | None = part
         try:
@@ -316,8 +314,7 @@ class WholeFragments:
             with contextlib.suppress(OSError):
                 part.unlink()
             raise
-        self._pending = bytearray()
-        self._start = self._size = self._at = 0  # position of the pending data, size of the file, FFmpeg's position
+        self._size = self._at = 0
         self._closed = False
         self.error: OSError | None = None
         """Error that ended the writing; nothing was written afterwards."""
@@ -326,20 +323,29 @@ class WholeFragments:
         """Write bytes at the current position."""
         if self.error is not None:
             return len(data)
-        if self._at != self._start + len(self._pending):
-            self._flush(everything=True)
-            self._start = self._at
-        self._pending += data
+        try:
+            written = 0
+            while written < len(data):
+                written += os.pwrite(self._file, data[written:], self._at + written)
+        except OSError as error:
+            self.error = error
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._size)
+            return len(data)
         self._at += len(data)
-        self._flush(everything=not self._boxes or self._start < self._size)
+        self._size = max(self._size, self._at)
+        if self._part is not None and any(mark in data for mark in _MEDIA):
+            # Where open files cannot be renamed, it is renamed when it is closed.
+            with contextlib.suppress(PermissionError):
+                take_name(self._part, self._path)
+                self._part = None
         return len(data)
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Change the position, or return the size."""
-        size = max(self._size, self._start + len(self._pending))
         if whence == _SEEK_SIZE:
-            return size
-        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: size}[whence]
+            return self._size
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
         return self._at
 
     def tell(self) -> int:
@@ -348,33 +354,9 @@ class WholeFragments:
 
     def read(self, size: int = -1) -> bytes:
         """Read at the current position: FFmpeg reads back data when it finishes the file."""
-        self._flush(everything=True)
         data = os.pread(self._file, max(self._size - self._at, 0) if size < 0 else size, self._at)
         self._at += len(data)
         return data
-
-    def _flush(self, *, everything: bool) -> None:
-        length = len(self._pending) if everything else _whole_boxes(self._pending)
-        if not length:
-            return
-        data = bytes(self._pending[:length])
-        try:
-            written = 0
-            while written < length:
-                written += os.pwrite(self._file, data[written:], self._start + written)
-        except OSError as error:
-            self.error = error
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._file, self._size)
-            return
-        del self._pending[:length]
-        self._start += length
-        self._size = max(self._size, self._start)
-        if self._part is not None and (_MEDIA[self._boxes] in data):
-            # Where open files cannot be renamed, it is renamed when it is closed.
-            with contextlib.suppress(PermissionError):
-                take_name(self._part, self._path)
-                self._part = None
 
     def check(self) -> None:
         """Raise the error that ended the writing, if any.
@@ -386,12 +368,10 @@ class WholeFragments:
             raise OSError(*self.error.args) from self.error
 
     def close(self) -> None:
-        """Write remaining data and close the file; an empty file is removed."""
+        """Close the file; an empty file is removed."""
         if self._closed:
             return
         self._closed = True
-        if self.error is None:
-            self._flush(everything=True)
         own = os.fstat(self._file)
         os.close(self._file)
         try:
@@ -405,19 +385,3 @@ class WholeFragments:
             self.error = self.error or OSError("it, or its folder, was removed while it was written")
         except OSError as error:
             self.error = self.error or error
-
-
-def _whole_boxes(data: bytearray) -> int:
-    """Return the length of complete boxes at the start; a ``moof`` is complete only with the ``mdat`` after it."""
-    at = whole = 0
-    while at + 8 <= len(data):
-        size = int.from_bytes(data[at : at + 4], "big")
-        kind = bytes(data[at + 4 : at + 8])
-        if size == 1 and at + 16 <= len(data):
-            size = int.from_bytes(data[at + 8 : at + 16], "big")
-        if size < 8 or at + size > len(data):
-            break
-        at += size
-        if kind != b"moof":
-            whole = at
-    return whole
