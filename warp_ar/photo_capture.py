@@ -316,7 +316,7 @@ class _Bracket:
     curve: Array | None
     notes: tuple[str, ...]
     is_odd: bool = False
-    """Return True if most photographs differ from the shown one."""
+    """True if most photographs differ from the shown one."""
 
     @property
     def is_deep(self) -> bool:
@@ -359,8 +359,7 @@ def _merge_plan(
         for one, why, how in zip(chosen, aligned.strangers, cut, strict=True)
         if why
     ]
-    is_odd = 2 * sum(map(bool, aligned.strangers)) >= len(photos)
-    if is_odd:
+    if aligned.is_odd:
         notes.append(f"most photographs differ from {reference.name}: if it is the odd one, show another (--shown)")
     notes += [f"{photo.name} has no exposure in EXIF, so EXIF is not used" for photo in untold]
     notes += _shift_notes(chosen, aligned, rough, outline.radius)
@@ -380,7 +379,7 @@ def _merge_plan(
         tuple(agreed.ratios[k] for k in kept),
         agreed.curve,
         (*notes, *agreed.notes, *more),
-        is_odd,
+        aligned.is_odd,
     )
 
 

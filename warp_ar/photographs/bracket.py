@@ -15,7 +15,7 @@ h_j over the codes, by robust least squares on
 over the median codes (u, v) of each level of brightness in two neighbouring pictures [DM97]. One curve absorbs a single
 ratio, but not contradictions: it must explain all levels of all pairs. So the fit is repeated with the time of one
 picture unknown, or the times of all pictures after a step, as if a photograph were missing. If the error then vanishes,
-that time is wrong. Of three pictures, any one explains the contradiction.
+that time is wrong. Of three pictures, any one may explain the contradiction; then this is said.
 
 References:
     [DM97] P. Debevec and J. Malik. Recovering high dynamic range radiance maps from photographs. SIGGRAPH 1997.
@@ -64,12 +64,21 @@ EXPLAINS = 0.4
 """Largest error that a wrong time leaves, relative to the error without it."""
 FAR = 40.0
 """Ratio of exposures above which two pictures share no usable pixels."""
-FEATURELESS = 6.0
-"""Standard deviation of codes below which a picture is featureless."""
-MOVED = 0.75
-"""Correlation over well exposed pixels below which a picture shows another scene."""
-RELIT = 0.1
-"""Logarithm by which places of formerly equal brightness may differ: 0.03 under the same light."""
+NOISE = 4
+"""Codes by which noise and compression change a pixel."""
+SATURATED = 235
+"""Code from which a channel may clip: some cameras end below 255, and resizing lowers small lamps."""
+SLACK = math.log(1.5)
+"""Logarithm by which a pixel may differ from the level of brightness that it belongs to."""
+BEND = math.log(2.0)
+"""Largest difference, as a logarithm, between the exposure step at a level of brightness and the median step."""
+COMPARED = 256
+"""Smallest size in pixels in which pictures are aligned; lamps of smaller ones are as thin as edges."""
+SHARED = 0.05
+"""Smallest share of the ball well exposed in two pictures that tells the step between them."""
+CONTRARY = 0.02
+"""Share of a ball that may contradict another picture: up to 0.015 in nine real brackets, of which a blurred picture
+has the most."""
 GAMMAS = (1.5, 2.7)
 """Range of gammas at code 40 of cameras' 8-bit pictures: Rec. 709 has 1.7, sRGB 2.1; linear raw files need no
 estimate."""
@@ -88,23 +97,10 @@ class Aligned:
     """Circle of the ball in each picture: column, row, radius in pixels."""
     patches: tuple[Image, ...]
     """Crops around the ball, all of one size, uint8 RGB."""
-    correlation: tuple[float, ...]
-    """Correlation of each photograph with the one that it was aligned to; 1 for the anchor, NaN if too few pixels are
-    well exposed in both."""
-    changed: tuple[float, ...]
-    """Logarithm of the factor between formerly equal places, for each photograph and the one it was aligned to; NaN if
-    too few pixels are well exposed in both."""
-
-    @property
-    def strangers(self) -> tuple[str, ...]:
-        """Return the reason to leave out each picture; empty if there is none."""
-        return tuple(map(_stranger, self.correlation, self.changed))
-
-
-def _stranger(alike: float, changed: float) -> str:
-    if alike < MOVED and not changed <= RELIT:
-        return f"it shows something else ({alike:.0%} alike)"
-    return f"its light differs, by {math.expm1(changed):.0%} from place to place" if changed > RELIT else ""
+    strangers: tuple[str, ...]
+    """Reason to leave out each picture; empty if there is none."""
+    is_odd: bool
+    """True if the anchor contradicts most of the others."""
 
 
 def cut_ball(image: Image, circle: Circle, size: int) -> Image:
@@ -154,7 +150,7 @@ def _gauss_newton(
     return np.asarray(-np.linalg.solve(normal, jacobian.T @ (weight * error)))
 
 
-def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[Array, float]:
+def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> Array:
     """Return the shift and scale that align a picture with another one of another exposure.
 
     Args:
@@ -163,8 +159,8 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
         disc: Mask of pixels that are used.
 
     Returns:
-        (columns, rows, log of the scale about the centre) at which ``other`` must be sampled, and the correlation
-        afterwards; NaN if fewer than ``LEAST_PIXELS`` can be used.
+        Columns, rows, and log of the scale about the centre at which ``other`` must be sampled; 0 if fewer than
+        ``LEAST_PIXELS`` can be used.
     """
     n = len(reference)
     gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in (reference, other)]
@@ -180,32 +176,20 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
         seen = np.asarray(cv2.remap(blurred, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
         return seen, well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
 
-    def alike(move: Array) -> float:
-        """Return the correlation; pixels that are dark or clipped in one picture are included."""
-        seen, _ = look(second, move)
-        told = disc & ~((first <= DARKEST) & (seen <= DARKEST)) & ~((first >= BRIGHTEST) & (seen >= BRIGHTEST))
-        if told.sum() < LEAST_PIXELS:
-            return math.nan
-        wanted = np.interp(first[told], np.arange(256), _tone_curve(first[told], seen[told]))
-        if np.ptp(wanted) == 0.0:
-            # Both pictures are featureless, or one has much that the other lacks.
-            return math.nan if np.std(seen[told]) < FEATURELESS else 0.0
-        return float(np.corrcoef(wanted, seen[told])[0, 1])
-
     move = np.zeros(3)
-    for coarse in (4.0, 2.0, 0.0, 0.0):
+    for coarse in (0.04 * n, 0.02 * n, 0.01 * n, 0.0):
         a, b = (cv2.GaussianBlur(p, (0, 0), coarse) if coarse else p for p in (first, second))
         for _ in range(8):
             seen, ok = look(b, move)
             if ok.sum() < LEAST_PIXELS:
-                return np.zeros(3), alike(np.zeros(3))
+                return np.zeros(3)
             wanted = np.asarray(np.interp(a, np.arange(256), _tone_curve(a[ok], seen[ok])), np.float32)
             step = _gauss_newton(seen, wanted, ok, x, y)
             move += np.clip(step, -0.02 * n, 0.02 * n)
             move[2] = float(np.clip(move[2], -0.1, 0.1))
             if np.abs(step[:2]).max() < 0.01:
                 break
-    return move, alike(move)
+    return move
 
 
 def align(
@@ -222,49 +206,103 @@ def align(
         exposures: Exposure of each, if known; pictures with a ratio above ``FAR`` cannot be aligned with each other.
         anchor: Index of the picture with which the others are aligned.
     """
-    size = int(min(PATCH, max(48, 2.1 * circles[anchor][2])))
-    disc = _disc(size)
-    times = exposures or [1.0] * len(images)
-    found = list(circles)
+    cut = int(np.clip(2.1 * circles[anchor][2], 48, PATCH))
+    size = max(cut, COMPARED)
+    disc, count = _disc(size), len(images)
+    times = np.log(exposures or np.ones(count))
+    found, good = list(circles), [anchor]
     patches = [cut_ball(image, circle, size) for image, circle in zip(images, circles, strict=True)]
-    correlation, changed = [math.nan] * len(images), [math.nan] * len(images)
-    correlation[anchor], good = 1.0, [anchor]
-    for k in sorted(set(range(len(images))) - {anchor}, key=lambda k: abs(k - anchor)):
-        (x, y, radius), rough = circles[k], patches[k]
+    for k in sorted(set(range(count)) - {anchor}, key=lambda k: abs(k - anchor)):
+        (x, y, radius), rough, least = circles[k], patches[k], math.inf
         for base in (anchor, *sorted(good[1:], key=lambda other: abs(k - other))):
-            if abs(math.log(times[k] / times[base])) > math.log(FAR):
+            if abs(times[k] - times[base]) > math.log(FAR):
                 continue
-            move, told = register(patches[base], rough, disc)
-            if math.isnan(told) or told < correlation[k]:
-                continue
-            pixel = 2.1 * radius / size
-            found[k] = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])
-            patches[k] = cut_ball(images[k], found[k], size)
-            correlation[k], changed[k] = told, _change(patches[base], patches[k])
-            if not _stranger(told, changed[k]):
+            move, pixel = register(patches[base], rough, disc), 2.1 * radius / size
+            circle = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])
+            patch = cut_ball(images[k], circle, size)
+            share = disagreement(patches[base], patch)
+            if share < least:
+                found[k], patches[k], least = circle, patch, share
+            if share <= CONTRARY:
                 good.append(k)
                 break
-    return Aligned(tuple(found), tuple(patches), tuple(correlation), tuple(changed))
+    shares = np.full((count, count), math.nan)
+    for a, b in itertools.combinations(range(count), 2):
+        step = times[b] - times[a] if exposures and b == a + 1 else None
+        shares[a, b] = shares[b, a] = disagreement(patches[a], patches[b], step)
+    stay, is_odd = _agreeing(shares, anchor)
+    why = "it shows something else in {:.0%} of the ball (another place or light, or something before it)"
+    reasons = ["" if stays else why.format(np.nanmax(row)) for stays, row in zip(stay, shares, strict=True)]
+    patches = [cut_ball(image, circle, cut) for image, circle in zip(images, found, strict=True)]
+    return Aligned(tuple(found), tuple(patches), tuple(reasons), is_odd)
+
+
+def _agreeing(shares: Array, anchor: int) -> tuple[NDArray[np.bool_], bool]:
+    """Return a mask of pictures without contradictions, and True if the anchor is the odd one or a tie decides.
+
+    The picture that others contradict most is removed until none is contradicted. If that is the anchor, those that
+    contradict it are removed instead.
+
+    Args:
+        shares: ``disagreement`` of each pair of pictures, (n, n); NaN if unknown.
+        anchor: Index of the shown picture.
+    """
+    shares = np.nan_to_num(shares)
+    stay, favour = np.ones(len(shares), bool), CONTRARY * (np.arange(len(shares)) == anchor)
+    while (contrary := (shares[:, stay] > CONTRARY).any(1) & stay).any():
+        stay[np.where(contrary, shares[:, stay].sum(1) - favour, -1.0).argmax()] = False
+    is_odd = not stay[anchor] or 2 * int(stay.sum()) <= len(stay)
+    return (stay if stay[anchor] else shares[anchor] <= CONTRARY), is_odd
+
+
+def disagreement(first: Image, other: Image, step: float | None = None) -> float:
+    """Return the share of a ball in which two aligned pictures of different exposures contradict each other.
+
+    Equally bright places of one are equally bright in the other, whatever the response. Clipped pixels are lower
+    bounds, dark ones upper bounds. Pixels count by their number and by their light in equal parts, because lamps are
+    small.
+
+    Args:
+        first: uint8 RGB (n, n, 3).
+        other: The same size.
+        step: Logarithm of the ratio of the exposures, used if too few pixels are well exposed in both.
+
+    Returns:
+        0 to 1; NaN if the pictures cannot be compared.
+    """
+    disc, near = _disc(len(first)), np.ones((3, 3), np.uint8)
+    both = sorted((first, other), key=lambda picture: -float(picture.mean()))
+    clips, ends = (cv2.dilate(np.uint8(one.max(2) >= SATURATED), np.ones((5, 5))) > 0 for one in both)
+    u, v = (cv2.cvtColor(cv2.GaussianBlur(one, (0, 0), 1.0), cv2.COLOR_RGB2GRAY) for one in both)
+    well = disc & ~clips & ~ends & (u > DARKEST) & (v > DARKEST)
+    if well.sum() >= max(LEAST_PIXELS, SHARED * disc.sum()):
+        ratio, level = _LOG_SRGB[v[well]] - _LOG_SRGB[u[well]], u[well] // 8
+        known = np.flatnonzero(np.bincount(level) > 20)
+        steps = np.array([np.median(ratio[level == k]) for k in known])
+        middle = np.median(ratio)
+        expected, slack = np.interp(u, 8 * known + 3.5, steps.clip(middle - BEND, middle + BEND)), SLACK
+    elif step is not None:
+        expected, slack = np.full(u.shape, -abs(step)), SLACK + BEND
+    else:
+        return math.nan
+    low = _LOG_SRGB[cv2.subtract(cv2.erode(u, near), NOISE)] + expected - slack
+    high = np.where(clips, math.inf, _LOG_SRGB[cv2.add(cv2.dilate(u, near), NOISE)] + expected + slack)
+    off = np.where(ends, math.inf, _LOG_SRGB[cv2.add(v, NOISE)]) < low
+    off |= _LOG_SRGB[cv2.subtract(v, NOISE)] > high
+    told = disc & ~((u <= DARKEST) & (v <= DARKEST)) & ~(clips & ends)
+    if not told.any():
+        return math.nan
+    # Single pixels and lines are edges.
+    off = cv2.morphologyEx(np.uint8(off & told), cv2.MORPH_OPEN, near) > 0
+    light = np.exp(np.maximum(_LOG_SRGB[v], np.minimum(low, 0.0)))
+    weight = told * (1.0 + light / light[told].mean())
+    return float((off * weight).sum() / weight.sum())
 
 
 def _disc(size: int) -> NDArray[np.bool_]:
     """Return the mask of a ball's pixels in its square, without the rim."""
     rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
     return np.asarray(np.hypot(rows, columns) < 0.93 * size / 2.1)
-
-
-def _change(first: Image, other: Image) -> float:
-    """Return the logarithm by which equally bright places of one picture differ in the other.
-
-    The tone curve cancels out. Light from another direction does not.
-    """
-    (u, v), *_ = _collect((first, other))
-    if len(u) < LEAST_PIXELS:
-        return math.nan
-    level = (u.mean(1) / 8).astype(int)
-    ratio = (_LOG_SRGB[v.astype(int)] - _LOG_SRGB[u.astype(int)]).mean(1)
-    middle = np.array([np.median(ratio[level == k]) if (level == k).any() else 0.0 for k in range(32)])
-    return 1.4826 * float(np.median(np.abs(ratio - middle[level])))
 
 
 def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
@@ -490,10 +528,11 @@ def agree_exposures(
         sure = [k for k, steps_ in enumerate(corrected) if _off(steps_, seen) <= HOLDS]
         sure = sure or [0] * (len(found) == 1 and not known)
         if sure:
-            claim, others = corrected[sure[0]], "; or ".join(readings[: sure[0]] + readings[sure[0] + 1 :])
-            notes.append(
-                f"{readings[sure[0]]}, and all others agree: the pixels are believed{others and f' ({others})'}"
-            )
+            claim, one = corrected[sure[0]], readings.pop(sure[0])
+            agree = "and all others agree: the pixels are believed"
+            if readings:
+                agree = f"or else {'; or '.join(readings)}: the times disagree, and the first is taken to be wrong"
+            notes.append(f"{one}, {agree}")
         elif found:
             doubts.append(f"a time contradicts the others ({'; or '.join(readings)})")
     ratios, off = tuple(np.cumprod([1.0, *claim]).tolist()), _off(claim, seen)
@@ -516,6 +555,8 @@ def agree_exposures(
     needed = np.flatnonzero(np.abs(np.log(claim / seen)) > HOLDS)
     if len(needed) == 1:
         doubts.append(f"only the step from {labels[needed[0]]} to {labels[needed[0] + 1]} needs this response")
+    elif len(claim) == 2:
+        doubts.append("three photographs do not tell a response from a wrong time")
     gamma = _gamma(curve)
     if not GAMMAS[0] <= gamma <= GAMMAS[1]:
         least, most = GAMMAS
