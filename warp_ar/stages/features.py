@@ -253,14 +253,10 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
     shadows = quality.method("environment_shadow") not in ("default", "none")
     if shadows and scene.objects and scene.proxies and has_environment(scene):
         layers.append("shadow_ratio")
-    if layers and scene.probes and quality.method("mirror_ball") not in ("default", "none"):
+    mirrored = bool(layers) and quality.method("mirror_ball") not in ("default", "none")
+    if mirrored and scene.probes:
         layers.append("mirror_ball")
-    if (
-        layers
-        and scene.has_gloss
-        and has_environment(scene)
-        and quality.method("mirror_ball") not in ("default", "none")
-    ):
+    if mirrored and scene.has_gloss and has_environment(scene):
         layers.append("reflected")
     return tuple(layers)
 
