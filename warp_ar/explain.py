@@ -59,10 +59,8 @@ def explain(options: argparse.Namespace) -> int:
 
 
 def print_numerics() -> None:
-    """Print the error model: precision, expected and largest measured error and hard cases of each stage."""
-    table = Table("stage", "precision", "expected worst error", "measured", "hard cases")
+    """Print the error model: precision and expected worst error of each stage."""
+    table = Table("stage", "precision", "expected worst error")
     for stage in STAGES:
-        numbers = stage.numerics
-        rows = " ".join(map(str, numbers.rows))
-        table.add_row(stage.name, numbers.precision, numbers.expected, f"{numbers.measured:.1e}", rows)
+        table.add_row(stage.name, stage.numerics.precision, stage.numerics.expected)
     Console(width=None if sys.stdout.isatty() else 160).print(table)

@@ -1,4 +1,4 @@
-"""How far float32 kernels are from their float64 twins: the figures that stand in the stages' ``Numerics``.
+"""How far float32 kernels are from their float64 twins: the errors that the stages' ``Numerics`` bound.
 
 python -m tests.hard_cases.measure_errors
 

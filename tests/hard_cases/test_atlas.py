@@ -36,11 +36,7 @@ def test_every_row_is_covered_at_every_method_of_every_stage(request, tmp_path: 
     assert not empty, f"{len(empty)} cells of the atlas have no test: {empty}"
 
 
-def test_the_error_model_names_every_stage_and_its_rows(capsys) -> None:
-    for stage in STAGES:
-        name, numbers = stage.name, stage.numerics
-        assert numbers.rows == tuple(row for row, stages in atlas.CONCERNS.items() if name in stages), name
-        assert 0 <= numbers.measured <= numbers.bound, name
+def test_the_error_model_names_every_stage(capsys) -> None:
     assert explain.main(["--numerics"]) == 0
     printed = capsys.readouterr().out
     assert all(stage.name in printed for stage in STAGES)

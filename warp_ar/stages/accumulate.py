@@ -24,11 +24,7 @@ class Accumulate(Stage):
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
     follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; m + a (x - m), exact where x = m",
-        bound=1e-5,
-        cause="an exponential and a dozen roundings",
-        measured=9.9e-08,
-        rows=(6, 7, 17, 18),
+        "float32; m + a (x - m), exact where x = m", 1e-5, "an exponential and a dozen roundings"
     )
     remembers: ClassVar[tuple[str, ...]] = (
         "accumulate_change",

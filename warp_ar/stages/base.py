@@ -115,11 +115,6 @@ class Numerics:
     """Largest error by analysis; tests check it if a float64 twin exists."""
     cause: str
     """Cause of that error."""
-    measured: float
-    """Largest error against a float64 twin on CPU, as ``python -m tests.hard_cases.measure_errors`` measures it in a
-    checkout."""
-    rows: tuple[int, ...]
-    """Rows of the atlas of hard cases that apply to the stage."""
     codes: bool = False
     """True if errors are in 8-bit codes."""
 

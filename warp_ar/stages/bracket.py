@@ -22,13 +22,7 @@ class Bracket(Stage):
     summary: ClassVar[str] = "merges alternating exposures: clipped pixels come from the shorter one"
     unread: ClassVar[str] = "nothing asks for the environment"
     follows: ClassVar[bool] = True
-    numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; running means",
-        bound=2e-6,
-        cause="a dozen roundings of weights and means",
-        measured=3e-08,
-        rows=(4, 6, 7, 17, 18),
-    )
+    numerics: ClassVar[Numerics] = Numerics("float32; running means", 2e-6, "a dozen roundings of weights and means")
     remembers: ClassVar[tuple[str, ...]] = tuple(f"bracket_{part}" for part in UNWRAPPED)
 
     @classmethod

@@ -19,11 +19,9 @@ class Composite(Stage):
     name: ClassVar[str] = "composite"
     summary: ClassVar[str] = "frame, virtual light on the receiver and virtual objects, in linear light"
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32 to 8-bit codes by exact thresholds",
-        bound=0.501,
-        cause="rounding to codes; untouched pixels to the bit",
-        measured=0.5,
-        rows=(6, 12, 17),
+        "float32 to 8-bit codes by exact thresholds",
+        0.501,
+        "rounding to codes; untouched pixels to the bit",
         codes=True,
     )
 

@@ -20,11 +20,7 @@ class Coverage(Stage):
     summary: ClassVar[str] = "share of each pixel that objects, proxies and balls cover"
     unread: ClassVar[str] = NOT_ASKED
     numerics: ClassVar[Numerics] = Numerics(
-        precision="counts of up to 16 samples, exact",
-        bound=0.0,
-        cause="none: shares are multiples of 1/16; edges fall to either side",
-        measured=0.0,
-        rows=(17,),
+        "counts of up to 16 samples, exact", 0.0, "none: shares are multiples of 1/16; edges fall to either side"
     )
 
     @classmethod

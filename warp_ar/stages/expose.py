@@ -27,12 +27,7 @@ class Expose(Stage):
     summary: ClassVar[str] = "simulates another exposure, with estimated radiance where the frame clips"
     subject: ClassVar[str] = "clipped pixels at a shorter exposure"
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32 to 8-bit codes by exact thresholds",
-        bound=0.501,
-        cause="rounding to codes; exposure 1 to the bit",
-        measured=0.5,
-        rows=(6, 7, 11, 12, 17),
-        codes=True,
+        "float32 to 8-bit codes by exact thresholds", 0.501, "rounding to codes; exposure 1 to the bit", codes=True
     )
 
     @classmethod

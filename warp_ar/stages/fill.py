@@ -28,11 +28,7 @@ class Fill(Stage):
     unread: ClassVar[str] = "nothing asks for the environment"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; running means, normalised",
-        bound=1e-5,
-        cause="one rounding a level and texel",
-        measured=4.8e-07,
-        rows=(3, 4, 6, 17, 18),
+        "float32; running means, normalised", 1e-5, "one rounding a level and texel"
     )
 
     @classmethod

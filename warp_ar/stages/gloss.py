@@ -33,11 +33,9 @@ class Gloss(Stage):
     name: ClassVar[str] = "gloss"
     summary: ClassVar[str] = "reflections of virtual objects and lights in polished receivers"
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; GGX by half vectors, no cancellation near the peak",
-        bound=2e-3,
-        cause="edges of what is mirrored fall to either side; 1e-7 of an angle in narrow highlights",
-        measured=1e-6,
-        rows=(6, 8, 17),
+        "float32; GGX by half vectors, no cancellation near the peak",
+        2e-3,
+        "edges of what is mirrored fall to either side; 1e-7 of an angle in narrow highlights",
     )
 
     @classmethod

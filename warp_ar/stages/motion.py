@@ -21,11 +21,9 @@ class Motion(Stage):
     summary: ClassVar[str] = "motion of each pixel's surface since the frame before, in pixels"
     unread: ClassVar[str] = NOT_ASKED
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; 0 to the bit where nothing moves",
-        bound=1e-3,
-        cause="difference of two projections: 1e-7 of a place in the picture over a motion of a few pixels",
-        measured=5.1e-6,
-        rows=(17,),
+        "float32; 0 to the bit where nothing moves",
+        1e-3,
+        "difference of two projections: 1e-7 of a place in the picture over a motion of a few pixels",
     )
 
     @classmethod

@@ -104,11 +104,7 @@ class Recover(Stage):
     unread: ClassVar[str] = "nothing asks for the environment"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32 transfer, float64 solution",
-        bound=6e-4,
-        cause="three steps of the search for the mirroring point",
-        measured=0.00016,
-        rows=(1, 3, 4, 5, 6, 7, 12, 13, 14, 17, 18),
+        "float32 transfer, float64 solution", 6e-4, "three steps of the search for the mirroring point"
     )
     remembers: ClassVar[tuple[str, ...]] = (
         *("recover_recovered", "recover_cells", "recover_found", "recover_share", "recover_level"),

@@ -37,11 +37,7 @@ class Shade(Stage):
     settings: ClassVar[tuple[str, ...]] = ("edge_samples", "light_shadow", "area_light")
     unseen_method: ClassVar[str | None] = "environment"
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; log1p for exponents, cross products for peaks",
-        bound=1e-4,
-        cause="1e-7 of an angle, to the power of 1e5",
-        measured=4.1e-07,
-        rows=(5, 6, 8, 9, 13, 14, 17, 18),
+        "float32; log1p for exponents, cross products for peaks", 1e-4, "1e-7 of an angle, to the power of 1e5"
     )
 
     @classmethod

@@ -20,11 +20,9 @@ class SphereMap(Stage):
     summary: ClassVar[str] = "the ball's square of the frame as a texture with mip levels (the paper)"
     unread: ClassVar[str] = "no stage is on the paper's own way to look the ball up"
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; running means, exact for equal texels",
-        bound=1e-4,
-        cause="places of 1e-7 of a frame's width, times the contrast of noise",
-        measured=2e-05,
-        rows=(6, 17),
+        "float32; running means, exact for equal texels",
+        1e-4,
+        "places of 1e-7 of a frame's width, times the contrast of noise",
     )
 
     @classmethod

@@ -19,13 +19,7 @@ class SummedArea(Stage):
     name: ClassVar[str] = "summed_area"
     summary: ClassVar[str] = "summed-area table of the frame: means over boxes of any size"
     unread: ClassVar[str] = "the exposure does not look at means of a pixel's surroundings"
-    numerics: ClassVar[Numerics] = Numerics(
-        precision="uint32 modulo 2^32",
-        bound=0.0,
-        cause="exact for boxes of up to 2^32 / 255 pixels",
-        measured=0,
-        rows=(6, 11, 12, 17),
-    )
+    numerics: ClassVar[Numerics] = Numerics("uint32 modulo 2^32", 0.0, "exact for boxes of up to 2^32 / 255 pixels")
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:

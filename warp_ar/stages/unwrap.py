@@ -33,11 +33,7 @@ class Unwrap(Stage):
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
     follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
-        precision="float32; running means",
-        bound=1e-4,
-        cause="Newton's method to 1e-7 rad, times the pixels of a frame's width, on noise",
-        measured=1.3e-05,
-        rows=(1, 2, 3, 4, 5, 6, 13, 14, 17, 18),
+        "float32; running means", 1e-4, "Newton's method to 1e-7 rad, times the pixels of a frame's width, on noise"
     )
 
     @classmethod
