@@ -21,7 +21,7 @@ from warp_ar.accuracy.metrics import flip_map
 from warp_ar.scene import Scene, load_scene
 from warp_ar.sources.sources import open_source
 
-TABLE = Path(__file__).resolve().parents[1] / "warp_ar" / "input" / "fault_errors.json"
+TABLE = Path(__file__).resolve().parents[1] / "warp_ar" / "checks" / "fault_errors.json"
 FRAMES = 6
 """Number of lit frames; the last one is compared."""
 
