@@ -6,12 +6,14 @@ import dataclasses
 import itertools
 import json
 
+import cv2
 import imageio.v3
 import numpy as np
 import pytest
 import warp as wp
 
 from tests.error_model import check_error
+from tests.photo_files import encode_srgb
 from tests.twins import bracket as reference
 from tests.twins import latlong as latlong_reference
 from tests.twins import unwrap as probe_reference
@@ -20,7 +22,7 @@ from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.environment import bracket
 from warp_ar.kernels.structs import make_environment_view
-from warp_ar.scene import Camera, Marker, MirrorMaterial, Object, Pose, Probe, Proxy, Scene
+from warp_ar.scene import Camera, Marker, MirrorMaterial, Object, Pose, PoseSpec, Probe, Proxy, Scene
 from warp_ar.session import Session
 from warp_ar.sources.exposures import MOST_EXPOSURES, find_exposure, plan_bracket
 from warp_ar.sources.sources import Synthetic
@@ -292,6 +294,33 @@ def test_a_folder_of_alternating_exposures(tmp_path, device):
     assert [result.shown for _, result, _ in pairs] == [True, False] * 3
     for (_, _, long), (_, _, short) in zip(pairs[::2], pairs[1::2], strict=True):
         np.testing.assert_array_equal(long, short)
+
+
+def test_a_folder_of_16_bits_is_merged_in_16_bits(tmp_path, device):
+    """Exposures so short that 8 bits round the light away."""
+    found, dark = {}, 1 / 64
+    with Synthetic("card", size=SIZE) as card:
+        matrix = card.camera_matrix
+        pictures = [frame.image for frame, _ in zip(card, range(4), strict=False)]
+    camera = Camera(*SIZE, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    poses = None
+    for bits in (0, 8, 16):
+        folder = tmp_path / str(bits)
+        folder.mkdir()
+        for index, picture in enumerate(pictures):
+            linear = decode_table("srgb")[:, 0][picture] * (dark * (1.0, 1 / 4)[index % 2] if bits else 1.0)
+            codes = encode_srgb(linear, 2**bits - 1 if bits else 255)
+            codes = np.ascontiguousarray(codes[..., ::-1], np.uint16 if bits == 16 else np.uint8)
+            cv2.imwrite(str(folder / f"{index}.png"), codes)
+        if bits:
+            (folder / "exposures.json").write_text(json.dumps([0.016, 0.004]))
+        scene = make_scene(camera=camera, **({} if poses is None else {"pose": poses}))
+        with Session(scene, source=folder, device=device, quality="low", outputs=("environment",)) as session:
+            results = [result for _, result in session]
+            found[bits] = np.array(results[-1].environment) / (dark if bits else 1.0)
+        poses = poses or PoseSpec(tuple((tuple(r.pose.rotation.ravel()), tuple(r.pose.translation)) for r in results))
+    error = {bits: np.median(np.abs(found[bits] - found[0])) / np.median(found[0]) for bits in (8, 16)}
+    assert error[16] < 0.01 < error[8]
 
 
 # ---- which exposures make a bracket ----

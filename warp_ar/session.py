@@ -200,10 +200,9 @@ class Session(Closing):
     def _open(self, scene: Scene, **given: Any) -> Pipeline:
         """Return a pipeline of a fixed quality."""
         source = self.source
-        linear = source.deep != "" and not given["exposures"]
         if source.deep == "light":
             check_linear(str(scene.camera.transfer))
-        source.keeps_depth = linear
+        source.keeps_depth = linear = source.deep != ""
         return Pipeline(scene, estimates="real_time" if source.live else "synchronous", linear=linear, **given)
 
     @property
