@@ -162,7 +162,7 @@ CASES = {
         ("nowhere/desk", "nowhere"),
         ("other --radius 3", "3 cm are 0.03"),
     ],
-    "doctor": [("mydesk", 'did you mean "my_desk"?'), ("nowhere", "nowhere")],
+    "doctor": [("mydesk", "mydesk: no such scene"), ("nowhere", "nowhere")],
     "__main__": [("doctr my_desk", 'no command doctr; did you mean "doctor"?')],
 }
 """Of each command, with what is given in every case: further arguments, and words of what is said."""
