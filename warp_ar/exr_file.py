@@ -40,16 +40,6 @@ _SPACES = {
 """Primaries by the value of the attribute ``colorInteropID`` (ASWF, Color Interop Forum)."""
 
 
-def exr_problem(path: pathlib.Path, error: BaseException) -> str:
-    """Return the reason for which OpenEXR could not read an existing file."""
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(len(_MAGIC))
-    except OSError as problem:
-        return reason(problem)
-    return reason(error) if start == _MAGIC else "it is another kind of file"
-
-
 @dataclasses.dataclass(frozen=True)
 class LinearPicture:
     """Linear radiance from a file."""
@@ -109,6 +99,9 @@ def _picture_part(
     if not is_file(path):
         raise error(f"there is no file {label}")
     try:
+        with path.open("rb") as stream:
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                raise ValueError("it is another kind of file")
         with OpenEXR.File(str(path), **how) as file:
             headers = [dict(part.header) for part in file.parts]
             for window in (header[name] for header in headers for name in ("dataWindow", "displayWindow")):
@@ -119,7 +112,7 @@ def _picture_part(
     except (RuntimeError, OSError, ValueError, LookupError) as problem:
         if isinstance(problem, WarpArError):
             raise
-        raise error(f"{label} cannot be read as OpenEXR: {exr_problem(path, problem)}") from problem
+        raise error(f"{label} cannot be read as OpenEXR: {reason(problem)}") from problem
     if len(headers) > 1:
         shown = [str(header.get("name")) for header in headers]
         every = path.with_stem("*")  # one message for a folder of frames

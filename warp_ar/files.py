@@ -170,20 +170,17 @@ def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-def read_text(
-    path: str | os.PathLike[str], error: type[WarpArError], label: str | None = None, expected: str = "text"
-) -> str:
+def read_text(path: str | os.PathLike[str], error: type[WarpArError], *, expected: str) -> str:
     """Return the text of a regular UTF-8 file; arguments as for `read_bytes`, ``expected`` names the format.
 
     Raises:
         WarpArError: As ``error``: the file cannot be read, is too large, or is not UTF-8.
     """
-    data = read_bytes(path, "text_bytes", error, label)
+    data = read_bytes(path, "text_bytes", error)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as problem:
-        label = str(path) if label is None else label
-        raise error(f"{label}: not a text file in UTF-8 (byte {problem.start}); expected {expected}") from problem
+        raise error(f"{path}: not a text file in UTF-8 (byte {problem.start}); expected {expected}") from problem
 
 
 def bracket_depth(text: str) -> int:
