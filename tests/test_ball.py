@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.kernel_rig import look_at
-from warp_ar.ball.ball import BallView, fit_ball
+from warp_ar.ball.ball import fit_ball
 from warp_ar.scene import Camera, Marker, Probe, Proxy, Scene, load_scene
 from warp_ar.session import Session
 
@@ -117,19 +117,6 @@ def test_through_a_lens_that_bends(clip):
     fit = fit_ball(bent, camera, rough((3.0, -3.0, 0.5)), search=0.006)
     assert fit.is_good
     assert error_mm(fit) < FOUND_HARD_MM
-
-
-@pytest.mark.parametrize("count", [4, 5, 8])
-def test_points_are_where_opencv_has_them(count):
-    rng = np.random.default_rng(count)
-    camera = make_camera(tuple(rng.normal(0.0, 0.05, count)))
-    pose = look_from(np.array([0.05, -0.4, 0.3]))
-    points = rng.uniform(-0.1, 0.1, (50, 3))
-    wanted = cv2.projectPoints(
-        pose.apply(points), np.zeros(3), np.zeros(3), camera.matrix(), np.array(camera.distortion)
-    )[0].reshape(-1, 2)
-    view = BallView(np.zeros((SIZE[1], SIZE[0], 3), np.uint8), pose, camera, np.zeros((256, 3), np.float32))
-    np.testing.assert_allclose(view.project(points)[0], wanted, atol=1e-9)
 
 
 def test_a_plain_desk_says_nothing():

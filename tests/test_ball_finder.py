@@ -1,7 +1,5 @@
 """The ball's outline in a photograph."""
 
-import dataclasses
-
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +7,7 @@ import pytest
 from tests.photo_files import encode_srgb
 from tests.photo_room import exposed, photograph, sphere
 from tests.rendered_room import Room, look_at, render
-from warp_ar.ball.ball_finder import find_ball, silhouette, silhouettes
-from warp_ar.ball.ball_rim import gradients, radial_compression
+from warp_ar.ball.ball_finder import find_ball, silhouette
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera
 
@@ -74,30 +71,6 @@ def test_a_stand_and_a_wide_lens():
     assert np.abs([found.center[0] - x, found.center[1] - y, found.radius - r]).max() < CLOSE
     # Off the axis the silhouette is an ellipse: two half axes that a circle would mix up.
     assert found.axes[0] / found.axes[1] > 1.02
-
-
-def test_outlines_together_are_those_of_each_alone(picture):
-    camera = dataclasses.replace(photograph()[1], distortion=(-0.1, 0.03, 0.001, -0.002, 0.01))
-    spheres = sphere() + np.random.default_rng(0).normal(0.0, 0.1, (5, 3))
-    spheres[1] = (0.0, -9.9, 1.2)  # beyond 0.9 of the way to y, another axis spans its rim
-    points, normals = silhouettes(camera, spheres, 40)
-    slopes, radii = gradients(picture), np.linspace(30.0, 50.0, 5)
-    together = radial_compression(slopes, points, normals, radii)
-    for k, each in enumerate(spheres):
-        rim, out = silhouette(camera, each, 40)
-        # Rays to the rim touch the ball: they pass its centre at the radius.
-        flat = cv2.undistortPoints(
-            rim[:, None], camera.matrix(), np.array(camera.distortion), criteria=(3, 100, 1e-12)
-        )[:, 0]
-        rays = np.column_stack([flat, np.ones(len(flat))])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        if k != 1:  # whose rays are too oblique for the lens's inverse
-            assert np.linalg.norm(np.cross(rays, each), axis=1) == pytest.approx(1.0, abs=1e-6)
-        np.testing.assert_allclose(points[k], rim, atol=1e-9)
-        np.testing.assert_allclose(normals[k], out, atol=1e-9)
-        alone = radial_compression(slopes, rim[None], out[None], radii[k : k + 1])
-        assert together[k] == pytest.approx(float(alone[0]), abs=1e-9)
-    assert len(silhouette(camera, np.array([0.0, 0.0, 0.9]))[0]) == 0
 
 
 def test_bad_circles_and_pictures_without_a_ball():

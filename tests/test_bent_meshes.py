@@ -221,7 +221,7 @@ def test_pictures_follow_the_bending(device: str, tmp_path: pathlib.Path) -> Non
     """Frame after frame a pipeline shows what one of a still file with the closed form's vertices shows."""
     pose = look_at((0.0, -0.5, 0.3))
     moved = Object("mesh", file=bar(normals=False).save(tmp_path / "a.glb"), scale=0.08, play=Play("go"))
-    outputs: Any = {"device": device, "quality": "low", "outputs": ("image", "depth"), "culling": True}
+    outputs: Any = {"device": device, "quality": "paper", "outputs": ("image", "depth"), "culling": True}
     with Pipeline(make_scene(objects=(moved,)), **outputs) as pipeline:
         results = []
         for seconds in (0.0, 0.8, 1.6):

@@ -11,13 +11,10 @@ import pytest
 
 from tests.test_tracking import look, make_camera, render
 from warp_ar import calibrate
-from warp_ar.ball.ball import fit_ball
-from warp_ar.ball.ball_measure import measure_ball
-from warp_ar.calibration import camera_calibration, card, response
+from warp_ar.calibration import camera_calibration, response
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Probe, load_calibration
-from warp_ar.tracking.tracking import Tracker
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, load_calibration
 
 pytestmark = pytest.mark.slow
 
@@ -26,8 +23,6 @@ FOCAL = 0.003
 """Share of the focal length: 14 views with corners good to a tenth of a pixel; measured 0.0006."""
 CURVE = 0.012
 """Of clipping, linear: quantised codes and OpenCV's smoothing; measured 0.0097."""
-BALL_DRAWN_MM = 1.0
-"""A plain disc: what lies just outside the rim pushes it off by half a pixel; measured 0.86."""
 
 
 def test_card_prints_at_exact_size(tmp_path):
@@ -43,34 +38,6 @@ def test_card_prints_at_exact_size(tmp_path):
     assert np.abs(np.ptp(black, axis=0) + 1 - 0.08 * per_metre).max() <= 1  # each edge at its nearest pixel
     bar = np.argwhere(page[-round(0.01 * per_metre) - 4, :] == 0)
     assert abs(np.ptp(bar) + 1 - 0.1 * per_metre) <= 1
-
-
-@pytest.mark.parametrize(
-    "marker", [Marker("DICT_APRILTAG_36h11", 3), BOARD, Marker("DICT_4X4_50", board=CharucoBoard(4, 6, 0.03, 0.02))]
-)
-def test_card_shows_what_is_tracked(marker):
-    """The card seen straight on, a pixel per half millimetre, gives the pose at which a page of its size would look
-    so."""
-    drawn = card.draw_card(marker, 2000.0)
-    h, w = drawn.shape
-    camera = Camera(w, h, 1000.0, 1000.0, (w - 1) / 2, (h - 1) / 2)
-    track = Tracker(marker, camera).track(np.repeat(drawn[..., None], 3, 2), 0.0)
-    assert np.allclose(track.pose.translation, (0, 0, 0.5), atol=1e-3)
-    assert np.allclose(track.pose.rotation, np.diag([1, -1, -1]), atol=0.02)
-
-
-def test_default_board_fits_the_default_paper(tmp_path):
-    options = calibrate.make_parser().parse_args(["camera", "pictures"])
-    card = [
-        "card",
-        "--board",
-        options.board,
-        "--dictionary",
-        options.dictionary,
-        "--output",
-        str(tmp_path / "card.png"),
-    ]
-    assert calibrate.main(card) == 0
 
 
 def views(camera: Camera) -> list[np.ndarray]:
@@ -148,26 +115,6 @@ def test_response_is_recovered(tmp_path, capsys):
 def test_response_needs_a_bracket(exposures):
     with pytest.raises(UsageError, match="expected"):
         response.measure_response([np.zeros((8, 8, 3), np.uint8)] * len(exposures), exposures)
-
-
-def test_ball_stands_where_it_was_drawn():
-    camera, center, frames = make_camera(), np.array([0.05, 0.04, 0.035]), []
-    # Area-sampled 4 x 4: a pixel sees the ball where its ray passes the centre within a radius.
-    y, x = (np.mgrid[0:1920, 0:2560] + 0.5) / 4 - 0.5
-    rays = np.stack([(x - 319.5) / 640, (y - 239.5) / 640, np.ones_like(x)], -1)
-    rays /= np.sqrt(np.einsum("ijk,ijk->ij", rays, rays))[..., None]
-    for k in range(4):
-        pose = look(50, 15 * k - 20)
-        c = pose.apply(center)
-        passes = c @ c - (rays @ c) ** 2 < 0.035**2
-        hit = cv2.resize(passes.astype(np.float32), (640, 480), interpolation=cv2.INTER_AREA)
-        image = np.round(120 + hit[..., None] * (80, 70, 60)).astype(np.uint8)
-        frames.append((image, pose))
-    rough = center + np.array([0.006, -0.004, 0])
-    fit = fit_ball(frames, camera, Probe(tuple(rough), 0.035), search=0.01)
-    assert fit is None or not fit.is_good  # it mirrors nothing
-    report = measure_ball(frames, camera, Probe(tuple(rough), 0.035), keep_radius=True)
-    assert np.linalg.norm(np.subtract(report.center, center)) < BALL_DRAWN_MM / 1e3
 
 
 def test_a_picture_without_a_marker_is_counted(capsys, tmp_path):

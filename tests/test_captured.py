@@ -195,16 +195,6 @@ def test_colors_take_light_and_emitters_to_the_cameras(tmp_path, device):
     assert Light.load(tmp_path / "light.exr").recolored(np.diag([-1.0, 1.0, 1.0])).emitters[0].power == (0.0, 2.0, 4.0)
 
 
-def test_virtual_lights_stand_beside_a_captured_one(tmp_path):
-    constant(0.4).save(tmp_path / "light.exr")
-    text = SCENE.replace("[light]", "[[light]]") + '[[light]]\nkind = "point"\nat = [0, 0, 1]\nintensity = 1.0\n'
-    scene = loads_scene(text, tmp_path / "scene.toml")
-    assert scene.captured is not None
-    assert len(scene.lights) == 1
-    with pytest.raises(SceneError, match="one captured light"):
-        loads_scene(text + '[[light]]\nfile = "light.exr"\n', tmp_path / "scene.toml")
-
-
 def test_an_emitter_whose_place_is_known_keeps_it(tmp_path, device):
     """Elsewhere than where the light was captured it stands in another direction, and is nearer."""
     radiance = np.full((32, 64, 3), 0.05, np.float32)

@@ -109,16 +109,6 @@ def test_what_is_no_colour_is_clamped(device, transfer):
     np.testing.assert_array_equal(codes, [0, 0, 0, 0, 0, 255, 255, 255, 255])
 
 
-def test_channels_are_not_mixed(device, measured):
-    rng = np.random.default_rng(3)
-    values = rng.random((5000, 3)).astype(np.float32)
-    whole = encode(measured, values)
-    for channel in range(3):
-        alone = np.full_like(values, 0.123)
-        alone[:, channel] = values[:, channel]
-        np.testing.assert_array_equal(encode(measured, alone)[:, channel], whole[:, channel])
-
-
 def test_plateau_of_a_response_keeps_its_radiance(device, tmp_path):
     """Codes that mean the same radiance cannot all survive; what comes back means the same."""
     values = np.repeat(np.maximum(np.linspace(0, 1, 256) - 0.1, 0.0)[:, None], 3, axis=1)

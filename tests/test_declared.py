@@ -61,15 +61,6 @@ def test_what_cannot_be_is_named(call: Callable[..., Any], good: dict[str, Any],
             call(**{**good, name: wrong})
 
 
-@pytest.mark.parametrize(
-    ("call", "good"), [(call, good) for call, good in GOOD if isinstance(call, type) and call is not warp_ar.Session]
-)
-def test_what_can_be_is_taken(call: Callable[..., Any], good: dict[str, Any]) -> None:
-    made = call(**good)
-    if hasattr(made, "close"):
-        made.close()
-
-
 def test_maps_and_poses_have_their_shapes() -> None:
     for radiance, confidence in (
         (MAP[:, :9], SHARE),

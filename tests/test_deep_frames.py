@@ -24,7 +24,6 @@ from warp_ar.session import Session
 from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
 from warp_ar.sources.deep_frame import DeepFrame, srgb8
 from warp_ar.sources.sources import open_source
-from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow
 
@@ -237,22 +236,6 @@ def test_a_desk_in_the_dark_is_lit_as_a_bright_one(first: np.ndarray) -> None:
     assert shadow.max() < SCALED
     _, _, _, codes = lit(srgb8(dim * radiance), pose=pose)
     assert np.abs(codes["shadow_ratio"] - many["shadow_ratio"]).max() > 0.03, "8 bits do not hold it"
-
-
-def test_what_a_ball_shows_of_an_object_hides_light_above_white(first: np.ndarray) -> None:
-    """Where a virtual object stands before what the ball shows, none of the light behind it is left in the picture."""
-    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
-        pose = pipeline(first).pose
-    # Environment shadows take what no frame shows for white at most, so that bounced light does not grow alike.
-    quality = PRESETS["medium"].with_methods(environment_shadow="none")
-    _, dim, _, few = lit(np.full((120, 160, 3), 0.25, np.float32), pose, quality, linear=True)
-    _, bright, _, many = lit(np.full((120, 160, 3), 4.0, np.float32), pose, quality, linear=True)
-    ball = (few["mirror_ball"] != 0.0).any(-1) & (few["objects"][..., 3] == 0.0)
-    assert ball.any()
-    # 16 times the environment's part, and no more of a virtual light's. Were the plate taken for 1, three of its four
-    # parts would stay.
-    assert (np.abs(bright[ball]) < 16.0 * np.abs(dim[ball]) + 1e-3).all()
-    assert many["mirror_ball"].min() < -1.5
 
 
 def test_what_no_deep_frame_is_gets_one_line(first: np.ndarray) -> None:

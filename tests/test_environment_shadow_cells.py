@@ -24,8 +24,7 @@ pytestmark = pytest.mark.slow
 # --- Cells ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("secondary", "bounce", "partials"), [(1.0, "estimated", 2), (0.5, "traced", 8)])
-def test_queued_rays_find_the_same(device, bounce, secondary, partials):
+def test_queued_rays_find_the_same(device):
     """By one kernel or by three: with a box, a ball and a lamp at a place, all of which may be before the objects."""
     drawn = draw(with_sun(6, 20, 100.0))
     environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), ONE_BALL, drawn[2])
@@ -34,22 +33,21 @@ def test_queued_rays_find_the_same(device, bounce, secondary, partials):
         "proxies": (DESK, shape(BOX, (-0.12, 0.08, 0.04), (0.03, 0.04, 0.04))),
         "probes": [{"center": (0.1, 0, 0.03), "radius": 0.03, "reflectance": (0.8, 0.7, 0.6)}],
         "stride": 2,
-        "bounce": bounce,
-        "secondary": secondary,
+        "bounce": "traced",
+        "secondary": 0.5,
         "albedo": 0.5,
         "emitters": True,
     }
     one = run(drawn, **scene)
     assert one.min() < 0.7
-    found = run(drawn, **scene, partials=partials, queued=True)
+    found = run(drawn, **scene, partials=8, queued=True)
     np.testing.assert_allclose(found, one, atol=SUM_ERROR)
-    np.testing.assert_array_equal(run(drawn, **scene, partials=partials, queued=True), found)
-    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=partials, queued=True)
+    np.testing.assert_array_equal(run(drawn, **scene, partials=8, queued=True), found)
+    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, queued=True)
     assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
 
 
-@pytest.mark.parametrize("secondary", [0.5])
-def test_what_is_seen_from_one_side_hides_the_sky_from_both(device, tmp_path, secondary):
+def test_what_is_seen_from_one_side_hides_the_sky_from_both(device, tmp_path):
     """A sheet above the desk that faces up: rays of the desk come from behind it."""
     drawn = draw(with_sun(6, 20, 100.0))
     made = Gltf()
@@ -63,7 +61,7 @@ def test_what_is_seen_from_one_side_hides_the_sky_from_both(device, tmp_path, se
         "loaded": Scene(SceneCamera(W, H, 60, 60, W / 2, H / 2), objects=(sheet,)),
         "stride": 2,
         "bounce": "traced",
-        "secondary": secondary,
+        "secondary": 0.5,
         "filtered": False,
     }
     expected, _ = run(drawn, **about)

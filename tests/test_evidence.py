@@ -63,11 +63,6 @@ def test_a_card_of_which_nothing_would_be_left_is_not_covered():
     points, kind, light = printed(0.05)
     few = np.concatenate([np.flatnonzero(kind == Kind.INK)[:3], np.flatnonzero(kind == Kind.CARD)])
     assert not covered_card(points[few], kind[few], light[few]).any()
-
-
-def test_too_few_cells_are_no_card():
-    points, kind, light = printed(0.05)
-    few = np.concatenate([np.flatnonzero(kind == Kind.INK)[:3], np.flatnonzero(kind == Kind.CARD)])
     assert not check_card(points[few], kind[few], light[few]).holds
 
 

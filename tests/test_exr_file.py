@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import pathlib
 import sys
@@ -56,20 +55,6 @@ def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path, parts: int, c
             write_exr(path, CutShort(image, length))
     write_exr(path, CutShort(image, len(whole)))
     assert path.read_bytes() == whole
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
-def test_the_system_says_why_a_file_lacks_its_end(tmp_path: pathlib.Path) -> None:
-    import resource
-
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        with pytest.raises(OSError, match="large") as caught:
-            write_exr(tmp_path / "a.exr", OpenEXR.File(HEADER, {"Y": np.ones((20, 4), np.float32)}))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert caught.value.errno == errno.EFBIG
 
 
 RADIANCE = np.random.default_rng(1).uniform(0.0, 4.0, (4, 8, 3)).astype(np.float32)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import fractions
 
-import av
 import cv2
 import numpy as np
 import pytest
-from av.video.reformatter import VideoReformatter
 
 from tests.farm_rig import CLIPS, TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
 from warp_ar.farm.frames import index_frames, open_part, shown_ticks
-from warp_ar.sources.video_file import rgb_from_video
 
 pytestmark = pytest.mark.slow
 
@@ -87,14 +84,3 @@ def test_where_no_gpu_decodes_the_processor_does(tmp_path):
             return [(frame.index, frame.image.tobytes()) for frame in source]
 
     assert pictures(999) == pictures(None)
-
-
-def test_pictures_as_a_decoding_unit_gives_them_become_the_same_colours(tmp_path):
-    """Units give NV12: luma as in planes, chroma of both kinds in one."""
-    write_recording(tmp_path / "a.mp4", 2)
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        for picture in container.decode(video=0):
-            other = VideoReformatter().reformat(picture, format="nv12")
-            assert (other.colorspace, other.color_range) == (picture.colorspace, picture.color_range)
-            expected = rgb_from_video(VideoReformatter(), picture)
-            np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), other), expected)

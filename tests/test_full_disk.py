@@ -97,26 +97,6 @@ def test_a_limit_of_files_leaves_whole_frames_and_true_counts(tmp_path: pathlib.
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
 @pytest.mark.parametrize("name", VIDEOS)
-def test_a_limit_at_the_start_leaves_what_stood_there(tmp_path: pathlib.Path, name: str) -> None:
-    with open_sink(tmp_path / name, fps=24) as sink:
-        for level in range(20):
-            sink.write(flat(level))
-    before = (tmp_path / name).read_bytes()
-    rng = np.random.default_rng(0)
-
-    def fill() -> None:
-        with open_sink(tmp_path / name, fps=24) as sink:
-            for _ in range(20):
-                sink.write(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8))
-
-    with file_limit(4096), pytest.raises(SinkError, match="File too large"):
-        fill()
-    assert (tmp_path / name).read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
-@pytest.mark.parametrize("name", VIDEOS)
 def test_an_end_that_does_not_fit_leaves_the_fragments(tmp_path: pathlib.Path, name: str) -> None:
     # 60 frames take 110 to 124 kB: the last fragments fit or not, and so does what makes an ordinary file of them.
     outcomes = set()

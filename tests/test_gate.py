@@ -93,13 +93,12 @@ async def test_silence_and_half_a_header_are_cut() -> None:
         assert await is_cut(port, whole)
 
 
-@pytest.mark.parametrize("coding", [b"gzip", b"deflate", b"br"])
-def test_a_body_that_is_not_what_it_says_is_no_line_of_the_log(caplog: pytest.LogCaptureFixture, coding: bytes) -> None:
+def test_a_body_that_is_not_what_it_says_is_no_line_of_the_log(caplog: pytest.LogCaptureFixture) -> None:
     async def send() -> bytes:
         async with served() as site:
             reader, writer = await asyncio.open_connection("127.0.0.1", port_of(site.url))
             host = f"Host: 127.0.0.1:{port_of(site.url)}\r\nConnection: close\r\n".encode()
-            head = b"POST / HTTP/1.1\r\n" + host + b"Content-Encoding: " + coding + b"\r\nContent-Length: 90\r\n\r\n"
+            head = b"POST / HTTP/1.1\r\n" + host + b"Content-Encoding: gzip\r\nContent-Length: 90\r\n\r\n"
             writer.write(head + b"no such thing" + bytes(77))
             answer = await asyncio.wait_for(reader.read(), PATIENCE)
             writer.close()

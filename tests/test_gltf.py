@@ -181,23 +181,6 @@ def test_skins_and_morph_targets_that_move_are_no_loss(
     assert [record.getMessage() for record in caplog.records] == expected
 
 
-def test_what_is_not_shown_is_said_once(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
-    made = Gltf()
-    made.tree["extensionsUsed"] = ["KHR_materials_transmission", "KHR_materials_unlit", "EXT_\x1b[31m"]
-    made.material(extensions={"KHR_materials_sheen": {}, "KHR_materials_unlit": {}})  # one that the list lacks
-    made.tree["animations"] = [{"channels": [], "samplers": []}]
-    line = {"attributes": {"POSITION": made.array(SQUARE)}, "mode": 1}
-    made.node(made.square(), line, extensions={"EXT_mesh_gpu_instancing": {}})
-    path = made.save(tmp_path / "a.glb")
-    with caplog.at_level(logging.WARNING):
-        for _ in range(3):
-            materials_of(Object("mesh", file=path))
-    (record,) = caplog.records
-    extensions = "KHR_materials_transmission, EXT_\\x1b[31m, KHR_materials_sheen, EXT_mesh_gpu_instancing"
-    said = f"{extensions}, animations (an object's key play names one), points and lines"
-    assert record.getMessage() == f"{path}: not shown: {said}"
-
-
 def test_a_material_is_its_files_unless_the_scene_says_one(tmp_path: pathlib.Path) -> None:
     made = Gltf()
     made.material(pbrMetallicRoughness={"baseColorTexture": {"index": made.texture(PICTURE)}}, emissiveFactor=[1, 1, 1])

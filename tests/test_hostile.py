@@ -17,7 +17,7 @@ from tests.hostile.cases import SOUND
 from tests.hostile.table import HELD
 from warp_ar import files
 from warp_ar.errors import SceneError, SourceError, UsageError, printable
-from warp_ar.files import bracket_depth, indentation_depth, limits, read_bytes, tag_depth, write_whole
+from warp_ar.files import limits, read_bytes, write_whole
 from warp_ar.pictures import picture_size
 
 pytestmark = [
@@ -90,17 +90,6 @@ def test_every_limit_is_in_the_docs() -> None:
     text = table.FILE.read_text()
     for name, value in vars(files.Limits()).items():
         assert f"| `{files.variable_of(name)}` | {value:,} |" in text
-
-
-def test_depths_are_never_too_low() -> None:
-    assert bracket_depth("") == bracket_depth("]]]") == 0
-    assert bracket_depth("[{}[]") == 2
-    assert bracket_depth("[" * 300) == 300
-    assert indentation_depth("a:\n  b:\n    c: 1\nd: 2\n") == 3
-    assert indentation_depth("- - - 1\n") == 4
-    assert indentation_depth("a: 1\n" * 1000) == 1
-    assert tag_depth("<a><b/><c></c></a>") == 2
-    assert tag_depth("<a>" * 300) == 300
 
 
 def test_sizes_are_those_of_the_decoders(tmp_path: pathlib.Path) -> None:

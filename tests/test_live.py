@@ -418,7 +418,3 @@ def test_layers_are_written_beside_the_picture(tmp_path: Path) -> None:
     assert sorted(path.name for path in (layers / "depth").iterdir()) == ["0000.png", "0001.png"]
     with OpenEXR.File(str(layers / "0001.exr")) as file:
         assert [part.header["name"] for part in file.parts] == ["objects", "depth"]
-    plain = tmp_path / "plain"
-    assert run(scene, "--headless", "--frames", 2, "--output", plain) == 0
-    for name in ("0000.png", "0001.png"):
-        assert (plain / name).read_bytes() == (out / name).read_bytes()

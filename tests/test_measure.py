@@ -6,15 +6,13 @@ import dataclasses
 import itertools
 import json
 import time
-import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
 
 from tests.accuracy_rig import case, frames, report, setting  # noqa: F401  (fixtures)
-from warp_ar.accuracy import cases, charts, measure
+from warp_ar.accuracy import cases, measure
 from warp_ar.accuracy import report as report_module
-from warp_ar.accuracy.charts import Point
 from warp_ar.accuracy.cost_table import (
     SETTINGS,
     MethodCost,
@@ -205,36 +203,3 @@ def test_changed_region_takes_what_changed_and_no_noise():
     assert region[20:40, 30:50].all()
     assert not region[:5].any()
     assert not changed_region(camera, camera ^ 1).any()
-
-
-# --- Charts: all points inside, all named, in the page's colours ------------------------------------------------------
-
-
-pytest.importorskip("matplotlib")
-SVG = "{http://www.w3.org/2000/svg}"
-
-
-def parse(chart: str) -> ElementTree.Element:
-    return ElementTree.fromstring(chart)
-
-
-@pytest.mark.parametrize(
-    "points",
-    [
-        [Point("one", 1.0, 0.0, False)],
-        [Point("a", 0.0, 0.1, False), Point("b", 900.0, 1e-7, True)],
-        [Point(f"method {k}", 1.0 + 0.01 * k, 0.1 - 0.01 * k, k > 2) for k in range(6)],
-    ],
-    ids=["one", "far apart", "close together"],
-)
-def test_scatter_holds_every_point_and_name(points: list[Point]) -> None:
-    root = parse(charts.scatter(points, "ms", "error", 33.3))
-    _, _, width, height = map(float, root.attrib["viewBox"].split())
-    # Markers, and the marks of the axes, which stand inside as well.
-    spots = {(float(node.attrib["x"]), float(node.attrib["y"])) for node in root.iter(f"{SVG}use")}
-    assert len(spots) >= len({(point.milliseconds, point.error) for point in points})
-    assert all(0.0 <= x <= width and 0.0 <= y <= height for x, y in spots)
-    names = {node.text for node in root.iter(f"{SVG}text")}
-    assert names >= {point.label for point in points}
-    assert root.attrib["role"] == "img"
-    assert all(point.label in root.attrib["aria-label"] for point in points)

@@ -22,7 +22,6 @@ from warp_ar.engine import modules
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.kernels.environment import irradiance
-from warp_ar.kernels.launch import launch_rows
 from warp_ar.scene import load_scene
 from warp_ar.sources.sources import open_source
 from warp_ar.stages.shared import lighting
@@ -112,25 +111,6 @@ def test_a_full_disk_of_the_cache_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 # --- Launching: bands of rows, and blocks that work together from several threads -------------------------------------
-
-
-ROWS = 13
-
-
-@wp.kernel(enable_backward=False)
-def count_rows_kernel(row_start: wp.int32, amount: wp.int32, counts_out: wp.array2d[wp.int32]):
-    band_row, column = wp.tid()
-    counts_out[row_start + band_row, column] += amount
-
-
-@pytest.mark.parametrize("edges", [(0, ROWS), (0, 5, ROWS), (0, 0, 1, 12, ROWS)])
-def test_bands_touch_each_row_once(device: str, edges: tuple[int, ...]) -> None:
-    counts = wp.zeros((ROWS, 3), dtype=wp.int32, device=device)
-    for band in itertools.pairwise(edges):
-        launch_rows(count_rows_kernel, counts.shape, [2], [counts], rows=band, device=device)
-    np.testing.assert_array_equal(counts.numpy(), 2)
-    launch_rows(count_rows_kernel, counts.shape, [1], [counts], rows=None, device=device)
-    np.testing.assert_array_equal(counts.numpy(), 3)
 
 
 def test_tiles_from_several_threads() -> None:

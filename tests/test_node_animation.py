@@ -16,7 +16,7 @@ from tests.twins import node_animation as twin
 from warp_ar.errors import SceneError
 from warp_ar.output.gltf_file import write_glb
 from warp_ar.output.shot import Shot
-from warp_ar.scene import Camera, Object, Play, Scene, dumps_scene, loads_scene
+from warp_ar.scene import Camera, Object, Play, Scene
 from warp_ar.scene.mesh_files import load_mesh, load_moving_mesh
 from warp_ar.scene.node_animation import Sampler, quaternion_matrix
 from warp_ar.scene.object_shapes import object_shapes, part_placements
@@ -188,24 +188,6 @@ def test_an_exported_shot_keeps_the_motion(tmp_path: pathlib.Path, scales: Any) 
         ]
         for one, other in zip(expected[1:], found[-2:], strict=True):
             np.testing.assert_allclose(np.sort(other, axis=0), np.sort(one, axis=0), atol=SINGLE)
-
-
-def test_a_scene_file_says_it(tmp_path: pathlib.Path) -> None:
-    moving().save(tmp_path / "a.glb")
-    (tmp_path / "a.ply").write_bytes(b"ply")
-    head = "schema = 1\n[camera]\nwidth = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\n[marker]\nsize = 0.08\n"
-    text = head + '[[object]]\nshape = "mesh"\nfile = "a.glb"\n[object.play]\nanimation = "go"\nloop = false\nstart = 2'
-    scene = loads_scene(text, tmp_path / "s.toml")
-    assert scene.objects[0].play == Play("go", loop=False, start=2.0)
-    assert loads_scene(dumps_scene(scene, tmp_path), tmp_path / "s.toml").objects == scene.objects
-    for wrong, message in (
-        (text.replace("a.glb", "a.ply"), r"play .*give one that ends in \.glb or \.gltf"),
-        (text.replace('"go"', "-1"), r"object\[0\]\.play\.animation = -1"),
-        (text.replace("loop", "lop"), r'did you mean "loop"'),
-        (text.replace("start = 2", "speed = 0"), r"play\.speed = 0"),
-    ):
-        with pytest.raises(SceneError, match=message):
-            loads_scene(wrong, tmp_path / "s.toml")
 
 
 def times(values: Any) -> Any:

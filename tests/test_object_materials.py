@@ -254,14 +254,6 @@ def test_objects_share_a_mesh_but_not_materials(device, tmp_path):
     np.testing.assert_allclose(seen["diffuse"][2:], np.tile(np.float32([0.1, 0.2, 0.3]), (2, 1)))
 
 
-def test_colours_of_a_ply_are_what_it_reflects(device, tmp_path):
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    ball.visual.vertex_colors = [255, 0, 128, 255]
-    ball.export(tmp_path / "ball.ply")
-    seen = look([Object("mesh", file=tmp_path / "ball.ply")], [(0, -3, 0)], FORWARD, device)
-    np.testing.assert_allclose(seen["diffuse"][0], [1.0, 0.0, ((128 / 255 + 0.055) / 1.055) ** 2.4], atol=1e-5)
-
-
 def test_material_libraries(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl shiny\nf 1 2 3\nusemtl matt\nf 3 2 1\n")

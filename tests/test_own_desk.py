@@ -50,6 +50,7 @@ def test_from_an_empty_folder(tmp_path, capsys):
         imageio.v3.imwrite(frames / f"{k:04d}.png", desk.photograph(eye, (0.0, 0.06, 0.0)))
 
     assert calibrate.main(["camera", str(photos), "--write", str(folder)]) == 0
+    assert f"next: python -m warp_ar.calibrate ball {folder} --write" in capsys.readouterr().out
     found = load_scene(folder).camera
     assert abs(found.fx / desk.camera.fx - 1) < FOCAL
     assert abs(found.fy / desk.camera.fy - 1) < FOCAL

@@ -139,6 +139,11 @@ def test_scene_files_say_markers() -> None:
     assert own_markers(scene) == (Marker(id=7, size=0.08), Marker(id=8, size=0.02), BOARD)
     again = loads_scene(dumps_scene(scene))
     assert (again.objects, again.lights, again.proxies) == (scene.objects, scene.lights, scene.proxies)
+    own = "[probe]\ncenter = [0, 0.07, 0.035]\nradius = 0.035\nmarker = { id = 7, size = 0.05 }\n"
+    scene = loads_scene(f"{HEADER}[marker]\nsize = 0.08\n{own}")
+    assert scene.probes[0].marker == CARD
+    assert own_markers(scene) == (CARD,)
+    assert loads_scene(dumps_scene(scene)).probes == scene.probes
 
 
 @pytest.mark.parametrize(
@@ -191,11 +196,3 @@ def test_a_ball_on_its_card_may_be_moved(device: str) -> None:
     assert means[0][0] > 4.0 * means[0][2]
     assert means[4][2] > 4.0 * means[4][0]
     np.testing.assert_allclose(means[5], means[4], rtol=0.05)
-
-
-def test_scene_files_say_the_markers_of_balls() -> None:
-    own = "center = [0, 0.07, 0.035]\nradius = 0.035\nmarker = { id = 7, size = 0.05 }\n"
-    scene = loads_scene(f"{HEADER}[marker]\nsize = 0.08\n[probe]\n{own}")
-    assert scene.probes[0].marker == CARD
-    assert own_markers(scene) == (CARD,)
-    assert loads_scene(dumps_scene(scene)).probes == scene.probes

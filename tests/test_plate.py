@@ -13,9 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.photo_files import encode_srgb, write_photo
-from tests.photo_room import FOCAL, GAIN, ROOM, SIZE, exposed, project
+from tests.photo_room import FOCAL, GAIN, ROOM, SIZE
 from tests.rendered_room import look_at, render
-from warp_ar import capture, live, pose
+from warp_ar import pose
 from warp_ar.command_line import EXIT_DONE, EXIT_USAGE
 from warp_ar.light.captured import Light
 from warp_ar.scene import PoseSpec, load_scene
@@ -45,26 +45,6 @@ def some_light(path):
 
 def numbers(*values):
     return [f"{value:.6f}" for part in values for value in np.ravel(part)]
-
-
-@pytest.mark.slow
-def test_two_photographs_light_an_object_in_the_plate(tmp_path, capsys):
-    ball, picture = write_photo(tmp_path / "ball.jpg", exposed(60), denominator=60), plate(tmp_path / "plate.jpg")
-    sheets = [
-        ["--rectangle", *numbers(*map(see, CORNERS)), "--rectangle-size", *numbers(WIDE)] for see in (project, on_plate)
-    ]
-    light, scene = tmp_path / "light.exr", tmp_path / "plate.toml"
-    circle = ["--circle", "272.3", "225.6", "49.2", "--device", "cpu"]
-    assert capture.main([str(ball), *sheets[0], *circle, "--output", str(light)]) == EXIT_DONE
-    assert pose.main([str(picture), *sheets[1], "--light", str(light), "--scene", str(scene)]) == EXIT_DONE
-    assert "the plate has 0.5 times the light's exposure" in capsys.readouterr().err
-    shown = ["--headless", "--device", "cpu", "--output", str(tmp_path / "out")]
-    assert live.main([str(scene), *shown]) == EXIT_DONE
-    lit = cv2.imread(str(tmp_path / "out" / "0000.png")).astype(np.float32)
-    # The virtual metal ball is as bright as the real one, but for their reflectances; the sheet's middle is the origin.
-    real, virtual = on_plate(ROOM.center), on_plate(CORNERS.mean(0) + np.array([0.12, 0.0, 0.04]))
-    means = [cv2.getRectSubPix(lit, (24, 24), tuple(map(float, at))).mean() for at in (real, virtual)]
-    assert means[1] / means[0] == pytest.approx((0.95 / ROOM.reflectance) ** (1 / 2.2), rel=0.15)
 
 
 def test_points_in_depth_tell_pose_and_focal_length(tmp_path, capsys):

@@ -139,7 +139,6 @@ def test_light_is_the_weighted_mean_of_the_balls(device, form):
     radiances = (1.0, 3.0, 0.2)
     expected = [reference.weights(THREE, point) @ radiances for point in points]
     np.testing.assert_allclose(look(radiances, points, form=form), np.stack([expected] * 2, 1), rtol=1e-5)
-    np.testing.assert_array_equal(look(radiances, points, several=False), look((1.0, 1.0, 1.0), points))
 
 
 def test_before_any_ball_is_seen_the_first_one_holds(device):

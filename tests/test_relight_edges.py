@@ -15,9 +15,9 @@ HANGING = {**shape(BOX, (0.02, 0.01, 0.15), (0.06, 0.04, 0.01)), "rotation": tur
 """Throws a slanted shadow; nearer to the camera than the desk."""
 
 
-@pytest.mark.parametrize("samples", [4])
-def test_edges_of_shadows_are_means_over_pixels(device, samples):
+def test_edges_of_shadows_are_means_over_pixels(device):
     """Against 256 times as many pixels: n samples err less than n random ones would, by 1 / sqrt n of what one does."""
+    samples = 4
     lights = [point((-0.1, 0.05, 0.5)), {**point((0.2, 0.1, 0.4)), "kind": DIRECTIONAL, "direction": unit(1, 0.5, -2)}]
     hard = run_edges(1, lights, [HANGING])
     truth = pixel_means(run_edges(1, lights, [HANGING], rect=(0, 16 * H, 0, 16 * W), detail=16), 16)
@@ -73,13 +73,12 @@ def test_edges_leave_balls_to_themselves(device):
     assert (smooth == hard)[~shown].all(-1).mean() > 0.9
 
 
-@pytest.mark.parametrize("listed", [5])
-def test_listed_edges_are_the_same(device, listed):
+def test_listed_edges_are_the_same(device):
     """Sampled on their own, or in place where the list does not hold them all."""
     lights = [point((-0.1, 0.05, 0.5))]
     box = shape(BOX, (0.0, 0.1, 0.04), (0.1, 0.06, 0.04)) | {"rotation": turn_z(0.3)}
     ball = {"center": (0.1, -0.05, 0.03), "radius": 0.03, "reflectance": (0.6, 0.6, 0.6)}
-    expected, got = (run_edges(4, lights, [HANGING], (DESK, box), [ball], listed=n) for n in (0, listed))
+    expected, got = (run_edges(4, lights, [HANGING], (DESK, box), [ball], listed=n) for n in (0, 5))
     hard = run_edges(1, lights, [HANGING], (DESK, box), [ball])
     assert (expected != hard).any(-1).sum() > 50
     np.testing.assert_allclose(got, expected, rtol=0 if device == "cpu" else 1e-6)

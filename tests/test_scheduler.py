@@ -115,34 +115,6 @@ def test_unchanged_input_skips(monkeypatch: pytest.MonkeyPatch, device: str) -> 
     scheduler.close()
 
 
-def test_switching_sets_of_stages_gives_the_same_answer(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
-    """Graphs are cached by the set of stages that are due; each must act on the current contents."""
-    arrays = inputs(device)
-    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), arrays, wp.get_device(device))
-    for value in (0, 3, 3, 9, -1):
-        arrays["frame"].fill_(value)
-        arrays.touch("frame")
-        scheduler.run()
-        np.testing.assert_array_equal(arrays["b"].numpy(), value + 2)
-    scheduler.close()
-
-
-def test_a_failing_band_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Failing(AddOne):
-        name, source, target = "fails", "frame", "a"
-
-        def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-            def launch(rows: tuple[int, int] | None) -> None:
-                raise RuntimeError("broken band")
-
-            return [Pass(launch, rows=SIZE)]
-
-    scheduler = Scheduler(plan_of(monkeypatch, (Failing,), ("a",)), inputs("cpu"), wp.get_device("cpu"), bands=2)
-    with pytest.raises(RuntimeError, match="broken band"):
-        scheduler.run()
-    scheduler.close()
-
-
 def test_after_a_failing_step_the_next_frame_makes_up_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """What had not failed may have run or not: all of it runs again."""
     broken = [True]

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tests.test_sources import no_thread_left, patches  # noqa: F401  (a fixture)
-from warp_ar.errors import SinkError, UsageError
-from warp_ar.output.environment_file import read_environment, write_environment
+from warp_ar.errors import SinkError
+from warp_ar.output.environment_file import write_environment
 from warp_ar.output.sink import FRAMES_WAITING
 from warp_ar.output.sinks import EnvironmentSink, FolderSink, open_sink
 from warp_ar.sources.sources import open_source
@@ -162,16 +162,6 @@ def test_png_that_cannot_be_written_is_told_once(tmp_path: pathlib.Path) -> None
     assert not list(tmp_path.glob(".*"))
 
 
-def test_environment_sink_numbers_its_files(tmp_path: pathlib.Path) -> None:
-    with EnvironmentSink(tmp_path / "env") as sink:
-        for index in range(6):
-            sink.write(radiance() + np.float32(index))
-        with pytest.raises(SinkError, match="float32"):
-            sink.write(flat(0))
-    for index in range(6):
-        assert np.array_equal(read_environment(tmp_path / "env" / f"{index:04d}.exr"), radiance() + np.float32(index))
-
-
 def test_light_of_balls_of_an_earlier_run_goes(tmp_path: pathlib.Path) -> None:
     for folder in (tmp_path, tmp_path / "ball_1", tmp_path / "ball_2", tmp_path / "ball_room"):
         with EnvironmentSink(folder) as sink:
@@ -225,16 +215,6 @@ def test_times_of_a_variable_rate_are_kept(tmp_path: pathlib.Path, name: str) ->
     assert shown == pytest.approx(times, abs=1.1e-3)
     assert all(np.diff(shown) > 0)
     assert levels(tmp_path / name) == pytest.approx([20 * index for index in range(8)], abs=VIDEO_LEVELS)
-
-
-@pytest.mark.parametrize("fps", [23.976, 29.97, 12.5, 60])
-def test_rate_is_kept(tmp_path: pathlib.Path, fps: float) -> None:
-    with open_sink(tmp_path / "clip.mp4", fps=fps) as sink:
-        for _ in range(5):
-            sink.write(flat(0))
-    with open_source(tmp_path / "clip.mp4") as source:
-        assert source.fps == pytest.approx(fps, rel=1e-4)
-        assert [frame.time for frame in source] == pytest.approx([index / fps for index in range(5)], abs=1e-3)
 
 
 @pytest.mark.parametrize("name", VIDEOS)
@@ -316,12 +296,6 @@ def test_bad_paths_are_told_at_open(tmp_path: pathlib.Path) -> None:
     assert (tmp_path / "frames.v3").is_dir()
 
 
-@pytest.mark.parametrize("fps", [0.0, -3.0, float("nan")])
-def test_impossible_rate(tmp_path: pathlib.Path, fps: float) -> None:
-    with pytest.raises(UsageError, match="fps"):
-        open_sink(tmp_path / "clip.mp4", fps=fps)
-
-
 @pytest.mark.parametrize("name", ["frames", "clip.mp4"])
 def test_other_images_are_refused(tmp_path: pathlib.Path, name: str) -> None:
     with open_sink(tmp_path / name, fps=24) as sink:
@@ -333,12 +307,3 @@ def test_other_images_are_refused(tmp_path: pathlib.Path, name: str) -> None:
             sink.write(flat(0, (32, 48)))
     with pytest.raises(SinkError, match="closed"):
         sink.write(flat(0))
-
-
-def test_last_png_that_cannot_be_written_is_told_by_close(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "0000.png").mkdir()
-    sink = open_sink(tmp_path, fps=24)
-    sink.write(flat(1))
-    with pytest.raises(SinkError, match=r"0000\.png"):
-        sink.close()
-    sink.close()

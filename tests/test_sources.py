@@ -409,31 +409,6 @@ def test_pixels_become_square(tmp_path: pathlib.Path, shape: tuple[int, int], wi
 FFMPEG = ["ffmpeg", "-v", "error", "-y"]
 
 
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg, whose picture is compared with")
-@pytest.mark.parametrize(("matrix", "shape"), [(TURNS[1], (2, 1)), (MIRRORS[3], (1, 2))])
-def test_a_display_matrix_and_pixel_shapes_together_are_as_ffmpeg_shows_them(
-    tmp_path: pathlib.Path, matrix: tuple[int, int, int, int], shape: tuple[int, int]
-) -> None:
-    picture = np.zeros((32, 64, 3), np.uint8)
-    picture[:16, :32], picture[16:, :16] = 250, 120
-    path = write_video(tmp_path / "clip.mp4", [picture] * 3)
-    shaped = tmp_path / "shaped.mp4"
-    way = ["-c", "copy", "-bsf:v", f"h264_metadata=sample_aspect_ratio={shape[0]}/{shape[1]}"]
-    subprocess.run([*FFMPEG, "-i", str(path), *way, "-aspect", f"{2 * shape[0]}:{shape[1]}", str(shaped)], check=True)
-    turn(shaped, matrix)
-    still = tmp_path / "still.png"
-    square = ["-vf", "scale=iw*sar:ih,setsar=1"] if matrix[0] else ["-vf", "scale=iw:ih/sar,setsar=1"]
-    subprocess.run([*FFMPEG, "-i", str(shaped), *square, "-frames:v", "1", str(still)], check=True)
-    shown = cv2.imread(str(still))[..., ::-1]
-    with open_source(shaped) as source:
-        assert ("square" in source.note) == (shape != (1, 1))
-        image = next(iter(source)).image
-    assert image.shape == shown.shape
-    # Resampling blurs the edges of patches by a column or two.
-    assert np.median(np.abs(image.astype(int) - shown)) <= VIDEO_LEVELS
-    assert np.abs(image.astype(int) - shown).mean() < 2 * VIDEO_LEVELS
-
-
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg, which writes the empty edit")
 def test_an_empty_first_edit_loses_no_frame(tmp_path: pathlib.Path) -> None:
     path = write_video(tmp_path / "clip.mp4", [np.full((32, 64, 3), 40 * k, np.uint8) for k in range(6)])
@@ -513,12 +488,6 @@ def test_size_that_changes_in_a_video_is_named(tmp_path: pathlib.Path) -> None:
         count, message = take_until_error(source)
     assert count == 6
     assert "frame 6 is 96x64, not 64x48" in message
-
-
-def test_real_clip(shared: pathlib.Path) -> None:
-    with open_source(shared / "real" / "aruco_clip" / "video.avi") as source:
-        assert source.size == (640, 480)
-        assert sum(1 for _ in source) == source.length == 145
 
 
 # ----------------------------------------------------------------------------------------------------------------- live

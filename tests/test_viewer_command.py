@@ -59,12 +59,6 @@ def test_address() -> None:
     assert Address("127.0.0.1").outside_url is None
 
 
-def test_the_command_serves_until_its_frames_are_lit(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["desk", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser", "--frames", "3"]
-    assert live.main(arguments) == 0
-    assert "http://127.0.0.1:" in capsys.readouterr().out
-
-
 def test_without_a_camera_frames_that_are_counted_never_come(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["desk", "--source", "1023", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser"]
     assert live.main([*arguments, "--frames", "1"]) == 2

@@ -12,7 +12,7 @@ import pytest
 
 from tests.viewer_rig import SIZE, page_scene
 from warp_ar.errors import SceneError, UsageError
-from warp_ar.scene import Exposure, Light, MirrorMaterial, PhongMaterial, Proxy, bundled_scenes, load_scene
+from warp_ar.scene import Camera, Exposure, Light, MirrorMaterial, PhongMaterial, Proxy, bundled_scenes, load_scene
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.card_layout import CARD_MARKER
@@ -101,6 +101,14 @@ def test_what_is_hidden_stays_hidden_when_something_before_it_goes() -> None:
     assert after.hidden == {("light", 1), ("object", 1)}
     assert [light.intensity for light in after.shown_scene().lights] == [2.0]
     assert [part.shape for part in after.shown_scene().objects] == ["sphere"]
+
+
+def test_a_camera_that_was_calibrated_is_known_when_it_comes_back() -> None:
+    first, again, other = (
+        Camera(*size, fx, fx, 1.0, 1.0) for size, fx in (((64, 48), 60.0), ((64, 48), 61.0), ((8, 6), 7.0))
+    )
+    wanted = Wanted(page_scene(), PRESETS["low"]).with_camera(first).with_camera(other).with_camera(again)
+    assert [wanted.camera_of(size) for size in ((64, 48), (8, 6), (4, 3))] == [again, other, None]
 
 
 def test_effects_are_left_out_of_what_is_shown() -> None:

@@ -86,18 +86,6 @@ def test_a_live_frame_is_stamped_by_its_source() -> None:
             running.until(lambda stamp=stamp: running.frames[-1].taken == pytest.approx(stamp, abs=1e-6))
 
 
-def test_pipelines_are_built_while_frames_flow(device: str) -> None:
-    """On CUDA one thread captures and replays graphs while another allocates, uploads and loads kernels."""
-    with Running(page_scene(), device=device) as running:
-        running.edit(type="compare", other="paper")
-        for index in range(2):
-            running.edit(type="effect", name="objects", on=index > 0)
-            running.edit(type="method", stage="irradiance", method=("clusters", "sh2")[index % 2])
-            running.until(lambda: not running.host.state_message()["building"])
-            assert running.next().image.any()
-        assert not [message for message in running.messages if message["type"] == "notice"]
-
-
 def test_an_edited_scene_gives_the_picture_of_its_file() -> None:
     """Saved and opened anew, the scene gives the same picture, bit for bit, of the same frames."""
     with Running(page_scene()) as running:

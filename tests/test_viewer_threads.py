@@ -6,23 +6,17 @@ import asyncio
 import dataclasses
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tests.test_viewer_budget import known_errors  # noqa: F401  (a fixture)
 from tests.viewer_rig import PATIENCE, SIZE, Running, page_scene, run, served
-from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
 from warp_ar.sources.sources import Synthetic
 from warp_ar.stages.quality import PRESETS
-from warp_ar.viewer import budget as budget_setting
 from warp_ar.viewer import setup as setup_checks
-from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.controls import BrowserCamera, Controls, Feed, guessed_camera
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.host import Host
@@ -186,37 +180,6 @@ def test_a_check_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         running.until(lambda: any(m["type"] == "setup" and m["busy"] is None for m in running.messages))
         running.next()
     assert "in fail" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("fault", [RuntimeError("Failed to allocate 12 bytes"), ZeroDivisionError("a fault")])
-def test_costs_that_cannot_be_measured_are_told_once(
-    known_errors: None,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    fault: Exception,
-) -> None:
-    began: list[None] = []
-
-    def steps(*_: Any) -> Iterator[tuple[float, None]]:
-        began.append(None)
-        yield 0.5, None
-        raise fault
-
-    monkeypatch.setattr(budget_setting, "measure_steps", steps)
-    told: list[dict[str, Any]] = []
-    setting = BudgetSetting(told.append, tmp_path)
-    setting.switch(50.0)
-    frame = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    with Pipeline(page_scene(), device="cpu", quality="low") as pipeline:
-        for _ in range(3):
-            with ThreadPoolExecutor(1) as helper:
-                setting.look(pipeline, frame, None, helper)
-                while setting.measuring:
-                    time.sleep(0.01)
-    notices = [message["text"] for message in told if message["type"] == "notice"]
-    assert len(notices) == 1
-    assert str(fault) in notices[0]
-    assert len(began) == 1
 
 
 def test_a_camera_can_be_left_where_the_scene_has_no_source() -> None:

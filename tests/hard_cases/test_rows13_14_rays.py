@@ -115,7 +115,7 @@ def _cube(device) -> Mesh:
 def test_broken_meshes_in_the_pipeline(device, combination, tmp_path):
     """Inside-out, duplicated and zero-area triangles together, an open fan on top: finite pictures at every method.
 
-    Once as an object and once as a proxy, which hides the ball in part.
+    As an object, and on the default preset once more as a proxy, which hides the ball in part.
     """
     mesh = generators.spoilt(generators.spoilt(generators.closed_sphere(2), "half inverted"), "duplicated")
     mesh = generators.spoilt(mesh, "zero area")
@@ -123,8 +123,8 @@ def test_broken_meshes_in_the_pipeline(device, combination, tmp_path):
     scene = make_scene()
     items = (Object("mesh", file=file, scale=0.03, at=(0.05, 0.08, 0.02), material=PhongMaterial()), *scene.objects)
     pebble = dataclasses.replace(mesh, vertices=np.float32([-0.07, -0.04, 0.08]) + 0.015 * mesh.vertices)
-    proxies = (Proxy("mesh", file=write(pebble, tmp_path / "pebble.ply")), *scene.proxies)
-    with Rig(device, combination=combination, objects=items, proxies=proxies) as rig:
+    hides = (Proxy("mesh", file=write(pebble, tmp_path / "pebble.ply")),) if combination == "medium" else ()
+    with Rig(device, combination=combination, objects=items, proxies=(*hides, *scene.proxies)) as rig:
         for name in ("noise", "white"):
             picture = rig.frame(FRAMES[name])
             outputs = {key: rig.get(key) for one, _ in rig.pipeline._scheduler._stages for key in one.wiring.writes}

@@ -430,7 +430,6 @@ PICTURES: dict[str, object] = {
 
 SHOT = Shot(loads_scene(SCENE), 24.0, (Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5])),))
 RADIANCE = np.ones((4, 8, 3), np.float32)
-BLACK = np.zeros((4, 8, 3), np.uint8)
 FILES: dict[str, Callable[[pathlib.Path], object]] = {
     "shot.usda": lambda path: write_usd(path, SHOT),
     "shot.glb": lambda path: write_glb(path, SHOT),
