@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import re
 import sys
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 
 class WarpArError(Exception):
@@ -50,6 +52,25 @@ def check_process(what: str, process: int) -> None:
 def warn_renamed(old: str, new: str, category: type[Warning] = DeprecationWarning) -> None:
     """Warn the caller's caller of a former name, which works until the next minor version."""
     warnings.warn(f"{old} is now {new}; the old name ends with the next minor version", category, stacklevel=3)
+
+
+def import_extra(extra: str, need: str, *modules: str, error: type[WarpArError] = UsageError) -> Any:
+    """Import modules of a package that an extra installs, and return the first.
+
+    Args:
+        extra: Name of the extra.
+        need: Beginning of the message: the thing that needs the package.
+        modules: Full names of the modules.
+        error: Type of the error.
+
+    Raises:
+        WarpArError: As ``error``: the package is not installed.
+    """
+    try:
+        first, *_ = map(importlib.import_module, modules)
+    except ImportError as problem:
+        raise error(f'{need}; install it with pip install "warp-ar[{extra}]"') from problem
+    return first
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:

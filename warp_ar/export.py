@@ -24,8 +24,9 @@ from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
 from warp_ar.output.places import claim_places, reads_of
 from warp_ar.output.shot import Shot, texture_files
-from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
+from warp_ar.output.usd_file import USD_SUFFIXES, write_usd
 from warp_ar.scene import Scene, load_scene
+from warp_ar.scene.pose_file import load_usd
 from warp_ar.signature import is_signed
 
 SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)

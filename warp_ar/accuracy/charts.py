@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import import_extra
 
 SIZE, SMALL = (5.6, 3.2), (4.0, 2.8)
 """Width and height of a large and of a small chart, in inches of 100 pixels."""
@@ -46,10 +46,7 @@ def require_plots() -> None:
     Raises:
         UsageError: The package matplotlib is not installed.
     """
-    try:
-        import matplotlib  # noqa: F401  (only pages need it)
-    except ImportError as error:
-        raise UsageError('charts need the package matplotlib: pip install "warp-ar[tradeoff]"') from error
+    import_extra("tradeoff", "charts need matplotlib", "matplotlib")
 
 
 def scatter(

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import import_extra
 
 Array = npt.NDArray[Any]
 
@@ -53,10 +53,7 @@ def flip_map(reference: Array, test: Array) -> npt.NDArray[np.float32]:
 
 def _evaluate_flip(reference: Array, test: Array) -> npt.NDArray[np.float32]:
     """Return FLIP of every pixel by its authors' program."""
-    try:
-        import flip_evaluator  # imported here, because only measurements need it
-    except ImportError as error:
-        raise UsageError('FLIP needs the package flip-evaluator: pip install "warp-ar[tradeoff]"') from error
+    flip_evaluator = import_extra("tradeoff", "FLIP needs flip-evaluator", "flip_evaluator")
     pictures = (np.asarray(picture, np.float32) / 255.0 for picture in (reference, test))
     errors = flip_evaluator.evaluate(*pictures, "LDR", applyMagma=False)[0]
     return np.asarray(errors, np.float32).reshape(reference.shape[:2])

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.device import usable_cores
-from warp_ar.errors import UsageError, reason
+from warp_ar.errors import UsageError, import_extra, reason
 from warp_ar.farm.jobs import Context, Job, Outcome, program_version
 from warp_ar.farm.manifest import RunError
 
@@ -275,10 +275,7 @@ class RayPool(Pool):
         Raises:
             UsageError: Ray is not installed, or no cluster answers at the address.
         """
-        try:
-            import ray
-        except ImportError as error:
-            raise UsageError("--ray needs Ray: pip install 'warp-ar[farm]'") from error
+        ray = import_extra("farm", "--ray needs Ray", "ray")
         self._ray = ray
         _connect(ray, address)
         found = ray.cluster_resources()

@@ -17,11 +17,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.errors import UsageError
 from warp_ar.files import store
 from warp_ar.output.shot import FILM_WIDTH, Body, ExchangeMaterial, Matrix, Shot, key_frames, texture_plan
 from warp_ar.scene.description import Light
 from warp_ar.scene.materials import IDENTITY
+from warp_ar.scene.pose_file import load_usd
 from warp_ar.signature import PROGRAM
 
 USD_SUFFIXES = (".usda", ".usdc", ".usd")
@@ -33,25 +33,6 @@ _COORDINATES = ("st", "st1")
 RGBA: TypeAlias = tuple[float, float, float, float]
 _TENTHS = 10.0
 """Factor on a USD camera's lens lengths, whose unit is a tenth of the stage's unit."""
-
-
-def load_usd() -> Any:
-    """Return USD's modules.
-
-    Raises:
-        UsageError: It is not installed.
-    """
-    try:
-        import pxr.Gf
-        import pxr.Sdf
-        import pxr.Usd
-        import pxr.UsdGeom
-        import pxr.UsdLux
-        import pxr.UsdShade
-        import pxr.Vt
-    except ImportError as error:
-        raise UsageError('USD files need usd-core; install it with pip install "warp-ar[exchange]"') from error
-    return pxr
 
 
 def write_usd(path: Path, shot: Shot) -> list[Path]:
@@ -231,7 +212,9 @@ class _Material:
             emission = self._read("emission", (*own.emission, 1.0), space="sRGB")("rgb")
         # An unlit material has neither reflection nor diffuse light.
         color, emission = ((0.0, 0.0, 0.0), color) if own.unlit else (color, emission)
-        inputs |= {"diffuseColor": ("Color3f", color), "emissiveColor": ("Color3f", emission)}
+        inputs["diffuseColor"] = "Color3f", color
+        if own.unlit or any(own.emission):
+            inputs["emissiveColor"] = "Color3f", emission
         if "metallic_roughness" in files:
             channel = self._read("metallic_roughness", (1.0, roughness, metallic, 1.0))
             roughness, metallic = channel("g"), channel("b")

@@ -9,17 +9,8 @@ from typing import Any
 
 import numpy.typing as npt
 
-from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.errors import SinkError, import_extra, reason
 from warp_ar.output.sink import Sink, check_image
-
-
-def _load() -> Any:
-    try:
-        import pyvirtualcam
-    except ImportError as error:
-        extra = 'pip install "warp-ar[virtual-camera]"'
-        raise UsageError(f"a virtual camera needs pyvirtualcam; install it with {extra}") from error
-    return pyvirtualcam
 
 
 class VirtualCameraSink(Sink):
@@ -37,7 +28,7 @@ class VirtualCameraSink(Sink):
     """
 
     def __init__(self, device: str | None, *, fps: float, size: tuple[int, int], paced: bool = False) -> None:
-        library = _load()
+        library = import_extra("virtual-camera", "a virtual camera needs pyvirtualcam", "pyvirtualcam")
         width, height = size
         try:
             self._camera: Any = library.Camera(width, height, fps, device=device)

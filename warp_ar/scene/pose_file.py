@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.errors import SceneError
+from warp_ar.errors import SceneError, UsageError, WarpArError, import_extra
 from warp_ar.exr_file import say_once
 from warp_ar.files import limits, parse_json, read_bytes, read_text, too_much
 from warp_ar.scene.description import PoseSpec
@@ -271,6 +271,17 @@ def _numbers(label: str, transform: Any, name: str, keys: tuple[str, ...]) -> li
     return [float(one) for one in found]
 
 
+def load_usd(error: type[WarpArError] = UsageError) -> Any:
+    """Return USD's modules.
+
+    Raises:
+        WarpArError: As ``error``: it is not installed.
+    """
+    names = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdLux", "UsdShade", "UsdUtils", "Vt")
+    modules = (f"pxr.{name}" for name in names)
+    return import_extra("exchange", "USD files need usd-core", "pxr", *modules, error=error)
+
+
 def read_usd(path: Path) -> tuple[RawPose, ...]:
     """Return the poses of the only camera of a USD file, one per frame from the stage's start to its end.
 
@@ -278,13 +289,7 @@ def read_usd(path: Path) -> tuple[RawPose, ...]:
         SceneError: usd-core is not installed, or the file cannot be used.
     """
     read_bytes(path, "mesh_bytes", SceneError)  # checks that it exists, is a regular file and not too large
-    try:
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-        import pxr.UsdUtils
-    except ImportError as error:
-        raise SceneError(f'{path}: USD files need usd-core; install it with pip install "warp-ar[exchange]"') from error
+    pxr = load_usd(SceneError)
     quiet = pxr.UsdUtils.CoalescingDiagnosticDelegate()  # captures USD's messages while it exists
     try:
         stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)

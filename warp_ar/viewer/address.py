@@ -12,7 +12,7 @@ import ssl
 from pathlib import Path
 from typing import Final
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, import_extra
 from warp_ar.files import read_bytes
 from warp_ar.viewer.gate import BACKLOG
 
@@ -42,12 +42,7 @@ def make_context(host: str) -> ssl.SSLContext:
     Raises:
         UsageError: The package that makes certificates is not installed, or a certificate cannot be made for ``host``.
     """
-    try:
-        import trustme
-    except ImportError as error:
-        raise UsageError(
-            "--tls without a file makes a certificate: pip install 'warp-ar[tls]', or name a PEM file"
-        ) from error
+    trustme = import_extra("tls", "--tls needs a PEM file, or trustme to make a certificate", "trustme")
     until = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=30)
     try:
         made = trustme.CA(organization_name="warp_ar").issue_cert("localhost", "127.0.0.1", host, not_after=until)
