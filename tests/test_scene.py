@@ -421,6 +421,7 @@ ERRORS = [
         BASE + "[[object]]\nshape = 'torus'\nmajor_radius = 1\nminor_radius = 1",
         r"minor_radius = 1: expected less than major_",
     ),
+    (BASE + SPHERE + "animate = { period = 3 }", r"animate\.period = 3: .*give sway too"),
     # Materials.
     (BASE + SPHERE + "[object.material]", r"object\[0\]\.material\.model is missing: expected one of \"phong\""),
     (

@@ -309,6 +309,7 @@ def _read_board(table: SceneTable) -> Board:
 
 def read_object(table: SceneTable) -> Object:
     """Read an ``[[object]]``."""
+    _check_motion(table)
     item = read_fields(table, Object)
     if item.play is not None and (item.file is None or item.file.suffix.lower() not in GLTF_SUFFIXES):
         table.fail("play", f"plays an animation of a file; give one that ends in {' or '.join(GLTF_SUFFIXES)}")
@@ -324,11 +325,22 @@ def _read_material(parent: SceneTable) -> Material:
     return read_fields(table, MATERIALS[model])
 
 
+def _check_motion(table: SceneTable) -> None:
+    motion = table.data.get("animate")
+    if isinstance(motion, dict):
+        inner = table.inner("animate", motion, list(motion))
+        if "period" in inner and "sway" not in inner:
+            inner.fail("period", "is the duration of a swing; give sway too, its excursion in metres")
+        if "pivot" in inner and "turn" not in inner:
+            inner.fail("pivot", "is the point to turn about; give turn too, in degrees per second")
+
+
 def read_light(table: SceneTable) -> Light | AreaLight:
     """Read a ``[[light]]`` without ``file``."""
     uses: dict[str, tuple[str, ...]] = {**Light.USES, **AreaLight.USES}
     kind = table.choice("kind", uses)
     table.only("kind", uses)
+    _check_motion(table)
     if kind in AreaLight.USES:
         return read_fields(table, AreaLight)
     if "target" in table and "direction" in table:

@@ -267,8 +267,9 @@ def _material(material: Material, key: str, value: Any) -> Material:
         if made is EmissiveMaterial and isinstance(color, Path):
             color = EmissiveMaterial.color
         return cast(Material, made(color))
-    if key not in vars(material):
-        raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(vars(material))}")
+    keys = [name for name in vars(material) if name != "image"]  # a page must not name files
+    if key not in keys:
+        raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(keys)}")
     return dataclasses.replace(material, **{key: value})
 
 
