@@ -6,8 +6,8 @@ thread runs ``serve``. It takes rows of the first stage that has work, calls the
 sleeps when there is no work. Python is called back only for steps in Python.
 
 A stage waits for the stages that write its inputs. Its passes run one after another; bands of one pass run in parallel.
-A thread takes the remaining rows over twice the number of threads. So pieces are large at first and small at the end,
-but none takes less than the time ``WORTH``, below which taking a piece costs too much.
+A thread takes as many rows at once, a *piece*, as remain divided by twice the number of threads. So pieces are large at
+first and small at the end. None takes less time than ``WORTH``: starting a shorter piece would cost too much.
 
 All of it is C++ inside one Warp kernel, compiled by Warp's own Clang, so that no other compiler is needed. The tables
 are arrays of 64-bit integers whose columns are named below. Functions of the operating system (semaphore, clock, yield)
@@ -84,7 +84,7 @@ BOUNDS_ROOM = 64
 MOST_STAGES = 64
 """Largest number of stages that can start at once."""
 WORTH = 30_000
-"""Shortest computing time of a piece, nanoseconds."""
+"""Shortest computing time of a piece (the rows that a thread takes at once), nanoseconds."""
 
 
 def _struct(name: str, fields: tuple[str, ...]) -> str:
@@ -309,5 +309,5 @@ def serve(state: wp.uint64, caller: wp.int32) -> wp.int32:
 
 @wp.kernel(enable_backward=False)
 def serve_kernel(state: wp.uint64, caller: wp.int32, failed_out: wp.array[wp.int32]):
-    """Run ``serve`` on one thread."""
+    """Run ``serve`` on one thread, and write its result, 1 after a failed callback, else 0."""
     failed_out[0] = serve(state, caller)

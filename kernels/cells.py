@@ -9,7 +9,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 STRIDE_ROWS = 480
-"""Rows of the frame to which settings of strides refer."""
+"""Rows of the frame for which strides are set; ``cell_stride`` converts them to other frames."""
 
 
 @wp.func
@@ -22,7 +22,8 @@ def cell_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
 def cell_place(pixel: wp.int32, stride: wp.int32, size: wp.int32) -> wp.float32:
     """Return the fractional cell index of a pixel's row or column.
 
-    It is whole at ``cell_pixel``, linear between, and clamped to the first and last cell.
+    It is an integer at the pixel that ``cell_pixel`` returns for a cell, linear between such pixels, and clamped to the
+    first and last cell.
     """
     last = (size - 1) / stride
     low = wp.clamp((pixel - stride / 2) / stride, 0, last)
@@ -44,10 +45,11 @@ class SurfaceCells:
 
 @wp.func
 def look_up_cells(cells: SurfaceCells, key: wp.int32, size: wp.vec2i, row: wp.int32, col: wp.int32) -> wp.vec4:
-    """Interpolate cells to a pixel bilinearly, among the cells of the pixel's surface alone.
+    """Interpolate cells bilinearly at a pixel, using only those that show the pixel's surface.
 
-    Return (RGB, 1), or zero if none of the four cells around the pixel shows its surface ``key``. If all cells that
-    show it have a bilinear weight of 0, return (their mean, 1). ``size`` holds the rows and columns of the frame.
+    ``key`` is the ``surface_key`` of the pixel, ``size`` the rows and columns of the frame. Return (RGB, 1), or zero if
+    none of the four cells around the pixel shows that surface. If all that show it have a bilinear weight of 0, return
+    (their mean, 1).
     """
     y = cell_place(row, cells.stride, size[0])
     x = cell_place(col, cells.stride, size[1])

@@ -1,4 +1,4 @@
-"""Conversion between 8-bit camera codes and linear radiance, for a known transfer function.
+"""Conversion between a camera's codes (8-bit pixel values) and linear radiance, for a known transfer function.
 
 A transfer is ``"srgb"``, ``"linear"``, ``"gamma:<exponent>"`` or the path of a measured response: a text file of 256
 lines with three numbers, the linear red, green and blue value of each code. Linear values are camera values: 0 is
@@ -79,7 +79,7 @@ def saturation_codes(table: wp.array[wp.vec3]) -> wp.vec3:
 
 @wp.func
 def below_saturation(code: wp.vec3ub, shown: wp.vec3ub, saturation: wp.vec3) -> wp.vec3ub:
-    """Limit ``code`` to the camera's saturation codes, but never below the frame's own code ``shown`` in that pixel."""
+    """Limit ``code`` to the code at which a channel saturates, or to the frame's code ``shown`` if that is higher."""
     return wp.vec3ub(
         wp.min(code[0], wp.max(shown[0], wp.uint8(saturation[0] + 0.5))),
         wp.min(code[1], wp.max(shown[1], wp.uint8(saturation[1] + 0.5))),
@@ -105,7 +105,7 @@ def is_clipped(code: wp.vec3ub) -> wp.vec3:
 
 @wp.func
 def encode_channel(table: wp.array[wp.vec3], value: wp.float32, channel: wp.int32) -> wp.uint8:
-    """Return the nearest code of one linear value; values below 0 and NaN give 0, values above 1 give 255."""
+    """Return the code nearest to one linear value; values below 0 and NaN give 0, values above 1 give 255."""
     x = wp.where(value > 0.0, wp.min(value, 1.0), 0.0)  # NaN is not above 0
     key = wp.int32(wp.sqrt(x) * _KEY_SCALE)
     count = table[key][channel]

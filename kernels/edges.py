@@ -1,4 +1,4 @@
-"""Anti-aliasing of edges in kernels of their own.
+"""Anti-aliasing of the edges of objects and shadows, in kernels of its own.
 
 Edge pixels take many samples, other pixels one. On a CPU edges are sampled in place. On CUDA that would stall whole
 warps, so edge pixels are listed first, their samples are computed in parallel, and averaged afterwards.
@@ -21,7 +21,7 @@ EDGE_THREADS = 1 << 16
 
 @wp.struct
 class EdgeList:
-    """The pixels in which edges lie."""
+    """List of the pixels in which edges lie."""
 
     count: wp.array[wp.int32]  # (1,): number of edges found, which may exceed n
     edges: wp.array[wp.vec2i]  # (n,): row and column of each

@@ -61,7 +61,7 @@ def add_emitters(irradiance: wp.vec3, emitters: wp.array[Emitter], point: wp.vec
 
 @wp.func
 def emitter_weight(away: wp.float32, off: wp.float32) -> wp.float32:
-    """Return the factor f, 0..1, by which an emitter rotates a direction: (1 - s^4)^2, or 0 from s = 1 on.
+    """Return g = f / (1 - f), the weight with which an emitter rotates a direction: f = (1 - s^4)^2, or 0 if s >= 1.
 
     Args:
         away: |w - u|, distance between the direction and the emitter's direction from the point.
@@ -101,7 +101,7 @@ def correct_parallax(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.
 
 @wp.func
 def seen_from(emitter: Emitter, place: wp.vec3) -> Emitter:
-    """Return an emitter as the environment at ``place`` shows it; a distant one unchanged."""
+    """Return an emitter with origin, direction, distance and power seen from ``place``; a distant one is unchanged."""
     out = emitter
     if emitter.distance > 0.0 and emitter.distance < MAX_DISTANCE:
         to_emitter = emitter.origin + emitter.distance * emitter.direction - place
@@ -116,7 +116,7 @@ def seen_from(emitter: Emitter, place: wp.vec3) -> Emitter:
 
 @wp.func
 def solid_angle_gain(emitters: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.float32:
-    """Return the ratio of solid angles along a direction, seen from a point and in the environment.
+    """Return the solid angle that light along a direction covers seen from ``point``, over that in the environment.
 
     It is (D / |r|)^2 in an emitter's direction and 1 far from all, interpolated by the weights of ``correct_parallax``.
     """

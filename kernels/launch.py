@@ -54,7 +54,7 @@ _NOTES = threading.local()
 
 @contextlib.contextmanager
 def noting() -> Iterator[list[Note]]:
-    """Record this thread's launches in the returned list, without executing them."""
+    """Append the launches and copies of this thread to the list that is yielded, without executing them."""
     before = getattr(_NOTES, "list", None)
     _NOTES.list = notes = []
     try:

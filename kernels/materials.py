@@ -114,7 +114,7 @@ def roughness_at(scene: RayScene, material: Material, point: SurfacePoint) -> wp
 
 @wp.func
 def emitted_radiance(scene: RayScene, material: Material, point: SurfacePoint) -> wp.vec3:
-    """Return the emitted radiance of a point, for a side that emits."""
+    """Return the radiance that a point emits on its emitting side; of an unlit material, the base colour."""
     if material.unlit != 0:
         base = wp.cw_mul(material.base_color, wp.vec3(point.color[0], point.color[1], point.color[2]))
         if material.base_texture >= 0:
@@ -159,9 +159,9 @@ def mix_metal(
 
 @functools.cache
 def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
-    """``surface_at(scene, dfg, hit, cos_o, spread) -> Surface``; ``dfg`` is a table as ``integrate_dfg`` writes it.
+    """Return the function ``surface_at(scene, dfg, hit, cos_o, spread) -> Surface``, the material at a hit.
 
-    ``spread`` is the angle of the ray's cone.
+    ``dfg`` is the table of ``integrate_dfg``, ``spread`` the angle of the ray's cone, radians.
 
     Args:
         models: Sorted models of the scene's materials.
@@ -237,8 +237,8 @@ def rgb(color: wp.vec4) -> wp.vec3:
 def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.float32) -> wp.float32:
     """Return the share of the environment's light in the lobe that reaches a point [LdR14].
 
-    ``occlusion`` is the share of the diffuse light that does. The result is 1 where nothing is hidden and, for a
-    mirror, where it is seen from ahead.
+    ``occlusion`` is the share of the environment's irradiance that reaches the point. The result is 1 where nothing is
+    hidden, and for a mirror that is viewed along its normal.
     """
     power = wp.pow(2.0, -16.0 * roughness - 1.0)
     return wp.clamp(wp.pow(wp.max(cos_o + occlusion, 0.0), power) - 1.0 + occlusion, 0.0, 1.0)
@@ -314,10 +314,10 @@ def schlick(cosine: wp.float32) -> wp.float32:
 
 @functools.cache
 def make_reflect_direct(models: tuple[int, ...]) -> wp.Function:
-    """``reflect_direct(surface, normal, wo, wi) -> vec3`` for the given models; zero unless the light is in front.
+    """Return the function ``reflect_direct(surface, normal, wo, wi) -> vec3``: reflected radiance of a virtual light.
 
-    The result times ``LightSample.irradiance_normal`` is radiance. It is zero for a mirror: the image of a point light
-    has no extent.
+    It is that radiance over ``LightSample.irradiance_normal``. It is zero for a light behind the surface, and for a
+    mirror, in which the image of a point light has no extent.
     """
     label = "_".join(map(str, models))
 

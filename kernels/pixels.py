@@ -36,13 +36,13 @@ def pixel_radiance(
 
 @wp.func
 def shown_radiance(picture: Picture, row: wp.int32, column: wp.int32) -> wp.vec3:
-    """Return the radiance of a pixel of a picture."""
+    """Return the linear radiance, RGB, of a pixel of the camera's frame."""
     return pixel_radiance(picture.frame, picture.decode_table, picture.linear, row, column)
 
 
 @wp.func
 def between_codes(table: wp.array[wp.vec3], value: wp.float32, code: wp.uint8, channel: wp.int32) -> wp.float32:
-    """Return the difference of a linear value from its 8-bit code's, in steps between codes (8-bit pixel values)."""
+    """Return the difference of a linear value from that of its code (8-bit pixel value), in steps between codes."""
     here = wp.int32(code)
     neighbour = wp.where(value > table[here][channel], wp.min(here + 1, 255), wp.max(here - 1, 0))
     step = wp.abs(table[neighbour][channel] - table[here][channel])
@@ -82,7 +82,7 @@ def keep_linear(table: wp.array[wp.vec3], value: wp.vec3) -> wp.vec3:
 
 @wp.func
 def clip_levels(table: wp.array[wp.vec3]) -> mat23:
-    """Return the values from which channels of a linear frame clip: alone, and if another channel clips too."""
+    """Return two rows of RGB values from which channels of a linear frame clip: alone, and if another channel clips."""
     return mat23(table[0][0], table[0][1], table[0][2], table[1][0], table[1][1], table[1][2])
 
 

@@ -51,7 +51,7 @@ def wrap_texel(index: wp.int32, size: wp.int32, mode: wp.int32) -> wp.int32:
 
 @wp.func
 def wrap_coordinate(u: wp.float32, mode: wp.int32) -> wp.float32:
-    """Return an equivalent coordinate near the texture, so that texel indices lose no digits."""
+    """Return a coordinate near 0..1 at which the texture has its value at ``u``: indices of texels lose no digits."""
     if mode == CLAMP:
         return wp.clamp(u, -1.0, 2.0)
     if mode == MIRRORED:

@@ -74,7 +74,7 @@ def measure_change_kernel(
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
-    """Write the mean signed change of one sector, found by one block of threads."""
+    """Write the mean of x - m, relative to the radiance, over one sector; one block of threads computes a sector."""
     sector_row, sector_column, lane = wp.tid()
     height = view.radiance.shape[0]
     width = view.radiance.shape[1]
@@ -129,7 +129,7 @@ def accumulate_environment_kernel(
     # In and out:
     environment_out: EnvironmentView,
 ):
-    """Accumulate one texel, in place."""
+    """Move one texel's radiance and confidence toward those of the current frame, in place."""
     band_row, j = wp.tid()
     i = row_start + band_row
     x = view.radiance[i, j]
@@ -207,7 +207,7 @@ def scale_radiance_kernel(
     # Out:
     radiance_out: wp.array2d[wp.vec3],
 ):
-    """Scale one texel."""
+    """Multiply the radiance of one texel by a colour."""
     i, j = wp.tid()
     radiance_out[i, j] = wp.cw_mul(radiance_out[i, j], factor)
 

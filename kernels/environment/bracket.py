@@ -111,7 +111,7 @@ def merge_exposures_kernel(
     # Out:
     view_out: EnvironmentView,
 ):
-    """Merge one texel."""
+    """Merge the exposures' radiance of one texel."""
     radiance = stack.radiance
     clipped = stack.clipped
     band_row, j = wp.tid()

@@ -143,7 +143,7 @@ def direction_weight(cos_theta: wp.float32) -> wp.float32:
 
 @wp.func
 def row_edge(row: wp.int32, height: wp.int32) -> wp.float32:
-    """Return the cosine of the polar angle at which a row of a map begins."""
+    """Return the cosine of the polar angle of the upper edge of a latlong map's row."""
     return wp.cos(PI * wp.float32(row) / wp.float32(height))
 
 
@@ -162,7 +162,7 @@ def sum_along_rows_kernel(
     # Out:
     cumulative_out: wp.array2d[wp.float32],
 ):
-    """Write the running sums of brightness along one row, by compensated summation (a sun next to a dim sky).
+    """Write the running sums of brightness along one row. Compensated summation keeps a dim sky next to a sun.
 
     Several texels are read before they are added, so that a CUDA thread waits for memory once, not for each texel.
     """

@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel is kept as it is."""
 SUPPORT = wp.constant(wp.float32(4.0))
-"""Factor from the mean trust of texels to the coarser texel's trust, at most 1; it keeps filling local."""
+"""Trust of a coarser texel, at most 1, over the mean trust of its finer texels; above 1, nearby texels fill gaps."""
 
 
 @wp.func
@@ -57,7 +57,7 @@ def seed_fill_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],  # radiance and trust
 ):
-    """Write a texel of level 0: radiance, and trust in it."""
+    """Write a texel of level 0 of the pyramid: radiance, and trust in it (0..1)."""
     band_row, j = wp.tid()
     i = row_start + band_row
     value = radiance[i, j]
@@ -80,7 +80,7 @@ def pulled(
     width: wp.int32,
     most: wp.float32,
 ) -> wp.vec4:
-    """Return a texel of the next coarser level: the mean over its exact area, of values limited to ``most``."""
+    """Return (R, G, B, trust) of a texel of the next coarser level: means over its area, of radiance up to ``most``."""
     top = wp.float32(i * fine_height) / wp.float32(height)
     bottom = wp.float32((i + 1) * fine_height) / wp.float32(height)
     left = wp.float32(j * fine_width) / wp.float32(width)
@@ -136,7 +136,7 @@ def completed(
     coarse_height: wp.int32,
     coarse_width: wp.int32,
 ) -> wp.vec3:
-    """Return a texel, completed from the coarser level in proportion to its missing trust."""
+    """Return the radiance of a texel, completed from the coarser level in proportion to its missing trust."""
     texel = levels[offset + i * width + j]
     value = wp.vec3(texel[0], texel[1], texel[2])
     if texel[3] < 1.0 and coarse_height > 0:
@@ -181,7 +181,7 @@ def finish_fill_kernel(
     # Out:
     environment_out: wp.array2d[wp.vec3],
 ):
-    """Complete level 0 into the map."""
+    """Complete one texel of level 0, and write it to the environment map."""
     band_row, j = wp.tid()
     i = row_start + band_row
     environment_out[i, j] = completed(

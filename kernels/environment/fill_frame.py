@@ -4,7 +4,8 @@ The ball does not show directions behind it, and near its rim a pixel covers man
 directions, behind and beside the ball. The radiance of a direction d from the ball's centre is read
 
 - if a proxy is met: at the pixel of the point that is hit, if the camera sees that point and it lies at least
-  ``OWN_SHADOW`` radii from every ball. Closer points lie in the ball's own shadow, which other objects do not see;
+  ``OWN_SHADOW`` radii from every ball. Closer points may lie in a ball's shadow, which is not part of the light on
+  objects elsewhere;
 - otherwise, at infinity: at the pixel whose ray has the direction d, if no ball or proxy is in its way.
 
 Near surfaces that are not modelled are seen from another side than the ball's. So the frame has a lower trust,
@@ -35,7 +36,7 @@ FRAME_TRUST = wp.constant(wp.float32(0.8))
 BALL_MARGIN = wp.constant(wp.float32(1.08))
 """Factor on a ball's radius in tests of what it hides, because its outline in the frame is blurred."""
 OWN_SHADOW = wp.constant(wp.float32(6.0))
-"""Distance from a ball, in radii, within which it shades surfaces: its shadow in light 10 degrees above them."""
+"""Distance from a ball, in radii, within which it may shade a surface: the shadow's length in light at 10 degrees."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which a camera ray's hit is the surface itself."""
 ENOUGH = wp.constant(wp.float32(0.999))
@@ -66,9 +67,9 @@ def shaded_by_ball(probes: wp.array[Probe], point: wp.vec3) -> wp.bool:
 
 @functools.cache
 def make_see_texel(proxies: tuple[int, ...]) -> wp.Function:
-    """``see_texel(picture, params, probes, scene, shape, ball, i, j) -> vec4``: sum and number of visible directions.
+    """Return the function ``see_texel(picture, params, probes, scene, shape, ball, i, j) -> vec4``.
 
-    The first three components are the sum of radiance over the directions of texel (i, j) that the frame shows.
+    Its result is the sum of radiance, RGB, over the directions in texel (i, j) that the frame shows, and their number.
     """
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 

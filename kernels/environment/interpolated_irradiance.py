@@ -34,7 +34,7 @@ class OtherBalls:
 
 @functools.cache
 def make_irradiance_at(form: Literal["sh", "map"], emitters: bool, several: bool) -> wp.Function:
-    """``irradiance_at(sh, latlong, emitters, others, point, normal) -> vec3``.
+    """Return the function ``irradiance_at(sh, latlong, emitters, others, point, normal) -> vec3``.
 
     Args:
         form: ``sh`` if irradiance is given by nine coefficients, ``map`` if by a latlong map; the other is not read.

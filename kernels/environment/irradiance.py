@@ -176,7 +176,7 @@ def sum_columns_kernel(
     # Out:
     row_sums_out: wp.array2d[wp.vec3],
 ):
-    """Compute one Fourier sum of one row, by one block of threads."""
+    """Compute one Fourier sum of one row of radiance; one block of threads computes one sum."""
     i, k, lane = wp.tid()
     total = wp.vec3()
     for j in range(lane, environment.shape[1], wp.block_dim()):
@@ -195,7 +195,7 @@ def sum_rows_kernel(
     # Out:
     irradiance_sh_out: wp.array[wp.vec3],
 ):
-    """Compute one coefficient, by one block of threads."""
+    """Compute one coefficient of the irradiance from the sums of all rows, by one block of threads."""
     c, lane = wp.tid()
     total = wp.vec3()
     for i in range(lane, row_sums.shape[0], wp.block_dim()):
@@ -321,7 +321,7 @@ def gather_clusters_kernel(
     # Out:
     clusters_out: wp.array[Cluster],
 ):
-    """Write the distant light of one block of texels."""
+    """Write the distant light (``Cluster``) that stands for one block of texels."""
     bi, bj = wp.tid()
     bi += row_start
     height = environment.shape[0]

@@ -33,7 +33,7 @@ def sum_rows_kernel(
     # Out:
     sums_out: wp.array[wp.vec4],  # luminance times direction, and luminance, over the row's solid angle
 ):
-    """Sum one row."""
+    """Sum luminance, and luminance times direction, over one row of the environment."""
     i = wp.tid()
     height = environment.shape[0]
     width = environment.shape[1]

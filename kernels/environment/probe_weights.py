@@ -37,7 +37,7 @@ TRUST_TIME = wp.constant(wp.float32(0.4))
 ENOUGH = wp.constant(wp.float32(0.5))
 """Share of measured texels in a ball's map from which the ball is trusted fully."""
 SEEN_AT_ALL = wp.constant(wp.float32(0.02))
-"""Least visible share at which a ball's position is updated."""
+"""Least share of a ball's map that the frame must show for the ball's position to be updated."""
 
 
 @wp.func
@@ -81,7 +81,7 @@ def measure_seen_kernel(
     # Out:
     seen_out: wp.array2d[wp.float32],
 ):
-    """Measure the share of texel corners of one row whose light one ball shows."""
+    """Measure the share of the texel corners in one row of a ball's map whose light the frame shows."""
     ball, row = wp.tid()
     count = wp.float32(0.0)
     for column in range(corners.shape[1]):
@@ -101,7 +101,7 @@ def update_places_kernel(
     # In and out:
     places_out: wp.array[wp.vec4],
 ):
-    """Update all balls, which are few, by one thread: the greatest trust of all is needed."""
+    """Update position and trust of all balls in one thread: trusts are divided by the greatest of all."""
     blend = 1.0 - wp.exp(-wp.max(params[0].time_step, 0.0) / TRUST_TIME)
     known = float(0.0)
     for ball in range(places_out.shape[0]):

@@ -38,7 +38,7 @@ DIFFUSE_SIZE = 4
 
 
 def glossy_level(lobe: int, lobes: int) -> int:
-    """Return the level used for a lobe of width 2^(lobe - (lobes - 1)).
+    """Return the mip level used for lobe number ``lobe`` of ``lobes``, whose width alpha is 2^(lobe - (lobes - 1)).
 
     The mirror and lobes narrower than a texel use level 0; the widest lobe uses the level of 2x2 texels.
     """
@@ -203,7 +203,7 @@ def trust_ball_kernel(
     confidence_out: wp.array2d[wp.float32],
     clipped_out: wp.array2d[wp.vec3],
 ):
-    """Write full confidence if the ball is in front of the camera, and the clipped channels of the nearest pixel."""
+    """Write one texel's confidence, 1 if the ball is in front of the camera, and the clipped channels of its pixel."""
     band_row, column = wp.tid()
     row = row_start + band_row
     disc = find_disc(params[0], probes[0])
@@ -282,7 +282,7 @@ def look_up_level(
 
 
 trust_ball = row_launcher(trust_ball_kernel, outputs=2)
-"""Write the confidence of a sphere map and its clipped channels, per direction.
+"""Write the confidence and the clipped channels of a sphere map for every direction of a latlong map.
 
 Args:
     params: (1,) FrameParams: the camera.

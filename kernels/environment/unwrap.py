@@ -41,12 +41,12 @@ RIM_START = wp.constant(2.5)
 """Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the
 pixel it finds there spreads over another 0.7; the rest is for the tracked outline, which errs by about half a pixel."""
 RIM_WIDTH = wp.constant(1.5)
-"""Pixels over which confidence then rises to its full value."""
+"""Pixels over which confidence rises to its full value, beyond ``RIM_START``."""
 
 ALL_ALIKE = -1
-"""Value of ``own`` for one map made from all balls."""
+"""Value of ``gather_probe``'s argument ``own`` that makes one map from all balls."""
 BORROWED = wp.constant(wp.float32(1.0e-3))
-"""Factor on the weight of a ball in the map of another ball."""
+"""Factor on the weight of one ball's pixels in the map of another ball."""
 
 MAX_SAMPLES = wp.constant(8)  # per side of a texel
 HALF_DENSITY = wp.constant(wp.float32(4.0))  # pixels per steradian: a ball of 8 pixels across
@@ -102,7 +102,7 @@ def any_perpendicular(axis: wp.vec3) -> wp.vec3:
 
 @functools.cache
 def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
-    """``hidden_by_proxies(scene, origin, ray, t_max, pad) -> bool``: whether a proxy hides a point of a ball.
+    """Return the function ``hidden_by_proxies(scene, origin, ray, t_max, pad) -> bool``: a proxy hides a ball's point.
 
     Proxies are enlarged by ``pad`` metres, the rim's width: pixels right beside a proxy may show it.
     """
@@ -142,9 +142,9 @@ def make_hidden_by_proxies(kinds: tuple[int, ...]) -> wp.Function:
 
 @wp.func
 def is_folded(camera: FrameParams, rays: wp.array2d[wp.vec2], point: wp.vec3, at: wp.vec3) -> wp.bool:
-    """Return whether a projection is invalid, which a polynomial lens model gives beyond its field of view.
+    """Return whether the ray of the pixel onto which a point is projected does not lead back to the point.
 
-    It is false if the ray of the pixel does not lead to the point.
+    A polynomial lens model gives such false projections beyond its field of view. Outside the frame nothing is tested.
 
     Args:
         camera: Camera of the frame.
@@ -257,7 +257,7 @@ Args:
     probes: ``Probe`` (P).
     rays: Undistorted normalised coordinates of the frame's pixel centres, ``wp.vec2`` (frame rows, columns).
     scene: Its proxies can hide the balls.
-    corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from there to the ball's
+    corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from that position to the ball's
         silhouette; the last is -1 where the direction is not seen.
 """
 
@@ -304,7 +304,7 @@ def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.
 
 @functools.cache
 def make_average_footprint(linear: bool) -> wp.Function:
-    """``average_footprint(frame, table, texel) -> Footprint``."""
+    """Return the function ``average_footprint(frame, table, texel) -> Footprint``, the frame's mean over a texel."""
     pixel = wp.vec3 if linear else wp.vec3ub
     to_light = keep_linear if linear else decode
     find_levels = clip_levels if linear else saturation_codes
@@ -363,7 +363,7 @@ def make_average_footprint(linear: bool) -> wp.Function:
 
 @functools.cache
 def make_gather_probe_kernel(linear: bool = False) -> wp.Kernel:
-    """Kernel for frames of 8-bit codes or ``linear`` ones."""
+    """Return the kernel of ``gather_probe``, for frames of 8-bit codes or, if ``linear``, of linear radiance."""
     pixel = wp.vec3 if linear else wp.vec3ub
     average_footprint = make_average_footprint(linear)
 

@@ -97,13 +97,13 @@ SAME_SURFACE = wp.constant(wp.float32(0.5))
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness |B|, in camera values, below which |M| / |B| is not computed."""
 NO_RAY = wp.constant(wp.float32(-1.0))
-"""Value of s for a pixel all of whose rays point below its surface: its lobe was not sampled."""
+"""Value of s (share of rays that meet something) in a pixel whose rays all point below its surface."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 """Least cosine between the normals of neighbours that are averaged."""
 
 
 OWN_RAYS = 4
-"""Least number of lobe rays per pixel at which neighbours are weighted by the difference of normals."""
+"""Least number of lobe rays per pixel at which averaging weights neighbours by the difference of normals."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,13 +189,13 @@ class SeenPoint:
 
 
 def ray_width(config: NearFieldConfig) -> float:
-    """Return the filter width of one of all lobe rays of a tile, over ``NearRay.spread`` (that of a single ray)."""
+    """Return the filter width of a lobe ray over ``NearRay.spread``: all rays of a tile of pixels share the lobe."""
     return RAY_WIDTH / (math.sqrt(max(config.lobe_count, 1)) * config.side)
 
 
 @functools.cache
 def make_footprint_of(config: NearFieldConfig) -> wp.Function:
-    """``footprint_of(at, ray) -> Footprint``: ray differentials of a ray.
+    """Return the function ``footprint_of(at, ray) -> Footprint``, the ray differentials of a ray.
 
     For a mirror they span the ray's part of the pixel, for a lobe a square around the ray's direction.
     """
@@ -245,7 +245,7 @@ def spread_at(fp: Footprint, t: wp.float32) -> wp.float32:
 
 @wp.func
 def mirrored_level(fp: Footprint, height: wp.int32) -> wp.float32:
-    """Return the level of the environment that matches the footprint of a mirror's ray.
+    """Return the level of the prefiltered environment whose lobe is as wide as the footprint of a mirror's ray.
 
     The solid angle of a texel of level 0 is subtracted, as that level is filtered over it already.
     A GGX lobe of width alpha has the peak density of a solid angle of 4 pi alpha^2.
@@ -257,7 +257,7 @@ def mirrored_level(fp: Footprint, height: wp.int32) -> wp.float32:
 
 @functools.cache
 def make_look_near(config: NearFieldConfig) -> wp.Function:
-    """``look_near(...) -> vec4``: (radiance, 1) of the first near surface on a ray, or zero if there is none.
+    """Return the function ``look_near(...) -> vec4``: (RGB, 1) of the first near surface on a ray, or zero without one.
 
     The receiver's radiance includes virtual shadows and virtual light.
     """
@@ -321,7 +321,7 @@ class Step:
 def step_to(
     params: FrameParams, picture: Picture, visible: VisibleObjects, at: SeenPoint, i: wp.int32, j: wp.int32
 ) -> Step:
-    """Return the step from a point to pixel (i, j); not found if that shows another object or lies beyond a crease."""
+    """Return the ``Step`` from a point to pixel (i, j); not found if it shows another object or lies past a crease."""
     out = Step()
     if not inside_rect(i, j, params.object_rect):
         return out
@@ -350,9 +350,10 @@ def shorter_step(
     axis: wp.vec3,
     angle: wp.float32,
 ) -> Step:
-    """Return the smaller of the steps to two opposite neighbours, or a plane mirror's step if neither is found.
+    """Return the ``Step`` of smaller turn to two opposite neighbours, or a plane mirror's step if neither is found.
 
-    ``aside`` is the offset to a neighbour; ``axis`` and ``angle`` give the plane mirror's step.
+    ``aside`` is the offset (rows, columns) to a neighbour. A plane mirror's reflected ray turns by ``angle``, that of a
+    pixel, along the unit vector ``axis``.
     """
     out = step_to(params, picture, visible, at, pixel[0] - aside[0], pixel[1] - aside[1])
     second = step_to(params, picture, visible, at, pixel[0] + aside[0], pixel[1] + aside[1])
@@ -368,7 +369,7 @@ def shorter_step(
 def pixel_footprint(
     params: FrameParams, picture: Picture, visible: VisibleObjects, at: SeenPoint, pixel: wp.vec2i, angle: wp.float32
 ) -> Footprint:
-    """Return a pixel's reflected ray differentials by differences to neighbours; ``angle`` is the pixel's, radians."""
+    """Return a pixel's reflected ray differentials, from differences to neighbours; ``angle`` is a pixel's, radians."""
     axes = frame_from_normal(reflect(at.wo, at.normal))
     across = wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
     down = wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
@@ -422,7 +423,10 @@ def make_see_point(config: NearFieldConfig) -> wp.Function:
 
 @wp.func
 def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32) -> NearRay:
-    """Return the ray toward a sample of the environment; its weight is 0 if the sample is behind the surface."""
+    """Return the ray from ``at`` toward an environment sample, of weight 0 if the sample is behind the surface.
+
+    ``share`` is the weight at the point of the ball to which the sample belongs.
+    """
     out = NearRay()
     toward = sample_toward(sample, at.hit.point)
     cosine = wp.dot(at.normal, toward.direction)
@@ -564,7 +568,7 @@ class NearLight:
 
 @functools.cache
 def make_count_rays(config: NearFieldConfig) -> wp.Function:
-    """``count_rays(at) -> vec2i``: number of rays toward samples of the environment, and into the lobe."""
+    """Return the function ``count_rays(at) -> vec2i``: numbers of rays to environment samples, and into the lobe."""
 
     @wp.func(module="unique")
     def count_rays(at: SeenPoint) -> wp.vec2i:
@@ -583,7 +587,7 @@ def make_count_rays(config: NearFieldConfig) -> wp.Function:
 
 @functools.cache
 def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel.
+    """Return the kernel of ``estimate_near_field``; equal configs share one kernel.
 
     One loop traces all kinds of rays, so that the code of tracing is compiled once. A copy for each kind, and for each
     iteration of an unrolled loop, takes NVRTC nine times as long.
@@ -693,7 +697,7 @@ def make_alpha_at(config: NearFieldConfig) -> wp.Function:
 
 @wp.func
 def fill_lobe(near: wp.vec4, transmitted: wp.vec4) -> wp.vec4:
-    """Return the radiance that ``shade`` adds, N + s M, and the share of the prefiltered environment that it omits.
+    """Return (RGB, share): the radiance N + s M that ``shade`` adds, and the share of the environment that it omits.
 
     Args:
         near: Means over rays: N and s.

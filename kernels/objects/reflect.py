@@ -129,19 +129,19 @@ def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> w
 
 @wp.func
 def knows_irradiance(distant: DistantLight) -> wp.bool:
-    """Return whether the scene has irradiance; a kernel for any scene must ask at run time."""
+    """Return whether an irradiance of the environment is given; a kernel for any scene tests this at run time."""
     return distant.irradiance_map.shape[0] > 0 or distant.irradiance_sh.shape[0] > 0
 
 
 @wp.func
 def knows_levels(distant: DistantLight) -> wp.bool:
-    """Return whether the scene has the prefiltered environment."""
+    """Return whether the prefiltered environment is given."""
     return distant.levels.shape[0] > 0
 
 
 @functools.cache
 def make_find_in_frame(trace: TraceConfig) -> wp.Function:
-    """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: pixel (x, y) that shows a proxy's hit.
+    """Return the function ``find_in_frame(params, picture, scene, probes, hit) -> vec2``: a proxy hit's pixel (x, y).
 
     x is -1 if the camera does not see the hit.
     """
@@ -173,10 +173,11 @@ def make_find_in_frame(trace: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
-    """``shade_unoccluded(scene, distant, hit, direction, spread) -> vec3``: radiance under the environment alone.
+    """Return the function ``shade_unoccluded(scene, distant, hit, direction, spread) -> vec3``, an object's radiance.
 
-    ``spread`` is the angle of the ray's cone. No lobe reads the environment sharper than that: a few rays that meet a
-    curved mirror would return a lamp's whole radiance or nothing, squares of noise on what they light.
+    It is lit by the environment alone. ``spread`` is the angle of the ray's cone, and the least width over which the
+    environment is read. Otherwise a few rays that meet a curved mirror would return a lamp's whole radiance or nothing,
+    which gives squares of noise on the surfaces that they light.
     """
     surface_at = make_surface(config.models, config.textures)
     glossy = make_reflected_radiance(config)

@@ -69,9 +69,9 @@ EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
 MIN_FACING = wp.constant(wp.float32(1.0e-3))
 
 ALONE = wp.constant(-1)
-"""Index of the only sample of a pixel without an edge."""
+"""Number that stands for the single sample, at the centre, of a pixel without an edge."""
 SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
-"""Treatments of edges by a kernel of ``make_shade_kernel``."""
+"""Treatments of edges by a kernel: sampled, listed for another kernel, or sampled if the list overflowed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,9 +150,9 @@ def face_viewer(normal: wp.vec3, geometric_normal: wp.vec3, wo: wp.vec3):
 
 @functools.cache
 def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
-    """``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: reflected light of emitters.
+    """Return the function ``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``.
 
-    Emitters are the scene's emitting objects.
+    Its result is the radiance toward ``wo`` that the surface reflects of the scene's emitting objects.
     """
     trace, samples = config.distant.trace, config.area_samples
     reflect_direct = make_reflect_direct(config.distant.models)
@@ -192,9 +192,10 @@ def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
 
 @functools.cache
 def make_sent_unlit(config: ShadeConfig) -> wp.Function:
-    """``sent_unlit(distant, hit, surface, normal, wo, near) -> vec3``: radiance without virtual lights.
+    """Return the function ``sent_unlit(distant, hit, surface, normal, wo, near) -> vec3``.
 
-    It is the sum of emitted light and reflected light, of the environment and of the near field ``near``.
+    Its result is the radiance without virtual lights: emitted light, and reflected light of the environment and of the
+    near field ``near``.
     """
     forms = config.distant
     glossy = make_reflected_radiance(forms)
@@ -246,9 +247,10 @@ def make_sent_unlit(config: ShadeConfig) -> wp.Function:
 
 @functools.cache
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
-    """``shade_hit(...) -> vec3``: radiance from a hit toward the origin of a ray of ``direction`` (not unit).
+    """Return the function ``shade_hit(...) -> vec3``: radiance from a hit toward the origin of a ray of ``direction``.
 
-    ``turn`` is passed to ``visible_share``; ``spread`` is the width of the ray at t = 1, metres.
+    ``direction`` is not unit. ``turn`` is the rotation, in turns, of the pixel's samples of lights;
+    ``spread`` is the width of the ray at t = 1, metres.
     """
     forms = config.distant
     surface_at = make_surface(forms.models, forms.textures)
@@ -339,9 +341,9 @@ def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> w
 
 @functools.cache
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
-    """``shade_sample(...) -> vec4``: radiance and coverage of one sample of a pixel.
+    """Return the function ``shade_sample(...) -> vec4``: radiance and coverage of one sample of a pixel.
 
-    The sample ``ALONE`` shades the hit ``centre``.
+    For the sample number ``ALONE`` it shades the hit ``centre`` without tracing a ray.
     """
     shade_hit = make_shade_hit(config)
     closest_visible = make_primary(config.distant.trace)

@@ -23,7 +23,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Layers:
-    """Layers over the frame, (H, W) each; a layer that the scene does not need is empty."""
+    """Layers composed over the camera's frame, (H, W) each; a layer that the scene does not need is empty."""
 
     objects: wp.array2d[wp.vec4]  # premultiplied linear radiance and coverage; ``virtual`` is a keyword of C++
     added: wp.array2d[wp.vec3]  # linear radiance
@@ -70,7 +70,7 @@ def is_changed(at: LayersAt) -> wp.bool:
 
 @wp.func
 def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
-    """Return the radiance of all layers over the frame's ``radiance``; the frame's changed radiance is at least 0."""
+    """Return the radiance of a pixel with its layers over the frame's ``radiance``, which they reduce to 0 at most."""
     physical = wp.max(wp.cw_mul(radiance, at.ratio) + at.added + at.mirror_ball, wp.vec3(0.0, 0.0, 0.0))
     return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
 

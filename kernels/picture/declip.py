@@ -61,7 +61,7 @@ TILE_LEVEL = 4
 """Level of the pyramid whose texels are tiles, 2^4 = 16 pixels wide."""
 _TILE_LEVEL = wp.constant(TILE_LEVEL)
 DARKEST = wp.constant(wp.float32(0.25))
-"""Value of the largest channel below which a pixel's hue has no weight: two stops below clipping."""
+"""Linear value of the largest channel below which a pixel's hue has no weight: two stops below clipping."""
 LEAST_HUE = wp.constant(wp.float32(1.0 / 64.0))
 """Smallest channel of a hue; bounds the estimate of one channel from another."""
 BRIGHTEST = wp.constant(wp.float32(1.0e4))
@@ -191,7 +191,7 @@ def pull_level_kernel(
     # Out (and in: the finer level):
     levels_out: wp.array[wp.vec4],
 ):
-    """Write one texel: the sum of its texels of the next finer level; 0 in inactive tiles."""
+    """Write one texel of a level: the sum of four texels of the next finer level; 0 in inactive tiles."""
     i, j = wp.tid()
     if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
         levels_out[offset + i * columns + j] = wp.vec4()
@@ -297,9 +297,10 @@ def complete_kernel(
 
 @functools.cache
 def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
-    """``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: recovered light along a pixel's ray.
+    """Return the function ``seen_by_ball(environment, probes, params, scene, ray) -> vec3``: light along a pixel's ray.
 
-    It is 0 if the ray meets a proxy, or if no light in the ray's possible directions clips in the ball.
+    It is the radiance that was recovered from the ball. It is 0 if the ray meets a proxy, or if the ball shows no
+    clipped light in the directions in which the ray's points may lie.
     """
     trace = make_trace(TraceConfig(objects=(), proxies=config.proxies))
 
@@ -343,7 +344,7 @@ def make_seen_by_ball(config: DeclipConfig) -> wp.Function:
 
 @functools.cache
 def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+    """Return the kernel of ``complete_core``; equal configs share one kernel."""
     seen_by_ball = make_seen_by_ball(config) if config.ball else None
 
     @wp.kernel(module="unique", enable_backward=False)

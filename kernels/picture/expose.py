@@ -143,7 +143,7 @@ def paper_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
 
 @wp.func
 def paper_mean_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
-    """Return factor / s for the reading w = a, with arguments as for ``paper_gain``."""
+    """Return factor / s with w = a (``paper_mean``), for a box mean in 0..255 and a scale in 0..1."""
     return 1.0 + (1.0 / wp.max(scale, LEAST_SCALE) - 1.0) * (mean / 255.0)
 
 
@@ -156,7 +156,7 @@ def expose_codes_kernel(
     # Out:
     codes_out: wp.array[wp.vec3ub],
 ):
-    """Write the output code of one input code, whose linear value is multiplied by the scale."""
+    """Write the output code for one code of the frame, whose linear value is multiplied by the scale."""
     i = wp.tid()
     codes_out[i] = encode(encode_table, scale[0] * decode_table[i])
 
@@ -239,9 +239,10 @@ def adapt_scale_kernel(
 
 @functools.cache
 def make_find_gain(method: str) -> wp.Function:
-    """``find_gain(code, i, j, clipped, s) -> float``: estimated radiance of a clipped pixel over its clipped value.
+    """Return the function ``find_gain(code, i, j, clipped, s) -> float``.
 
-    It is 1 for unclipped pixels, and for methods that use no box.
+    Its result is the estimated radiance of a clipped pixel over its clipped value, at the scale ``s``. It is 1 for
+    unclipped pixels, and for methods that use no box.
     """
     box_gain = paper_mean_gain if method == "paper_mean" else paper_gain
 

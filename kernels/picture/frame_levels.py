@@ -111,7 +111,7 @@ def shrink_frame_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """Write a texel of level 1."""
+    """Write a texel of level 1: the mean of 2 x 2 pixels of the frame with virtual shadows and light."""
     i, j = wp.tid()
     i += row_start
     height = picture.rays.shape[0]
@@ -157,7 +157,7 @@ def shrink_level_kernel(
 
 
 shrink_frame = row_launcher(shrink_frame_kernel, like=lambda params, picture, *_: level_size(*picture.rays.shape, 1))
-"""Write level 1 of a picture.
+"""Write level 1 of the mip levels of the frame with virtual shadows and virtual light.
 
 Args:
     params: (1,) FrameParams: light_rect, beyond which no virtual light is added.
@@ -174,7 +174,7 @@ Args:
     height: Rows of the frame.
     width: Columns of the frame.
     level: Number of the level.
-    levels_out: As in ``shrink_frame``.
+    levels_out: All levels, packed, (level_texels(H, W),) vec3; the finer level is read.
 """
 
 

@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def point_before(point: wp.vec3, now: Shape, before: Shape) -> wp.vec3:
-    """Return the previous position of a point of a rigid body, given the body's ``Shape`` now and before."""
+    """Return a rigid body's point's world position in the previous frame, given the body's ``Shape`` now and before."""
     if now.position == before.position and now.rotation == before.rotation and now.scale == before.scale:
         return point
     return before.rotation * (before.scale * to_local_point(now, point)) + before.position

@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SeparateLayers:
-    """The layers, (H, W) each; a layer that is not requested is empty."""
+    """Separate layers of the picture, (H, W) each; a layer that is not requested is empty."""
 
     plate: wp.array2d[wp.vec3]  # linear radiance
     objects: wp.array2d[wp.vec4]  # premultiplied linear radiance and coverage

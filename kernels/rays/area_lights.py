@@ -331,9 +331,9 @@ def light_as_point(scene: RayScene, light: AreaLight, point: wp.vec3) -> AreaSam
 
 @functools.cache
 def make_area_sample(samples: int) -> wp.Function:
-    """``area_sample(scene, point, normal, k, count, turn) -> AreaSample``: term k of ``area_count`` terms of (1).
+    """Return the function ``area_sample(scene, point, normal, k, count, turn) -> AreaSample``: term k of equation (1).
 
-    ``normal`` is the normal of the lit surface.
+    ``normal`` is that of the lit surface, ``count`` the number of terms, ``turn`` the pixel's result of ``tile_turn``.
     """
     candidates = 1 if samples >= MANY_SAMPLES else CANDIDATES
 
@@ -374,7 +374,7 @@ def make_area_sample(samples: int) -> wp.Function:
 
 @functools.cache
 def make_area_count(samples: int) -> wp.Function:
-    """``area_count(scene) -> int``: number of terms of equation (1), or of point lights; 0 if nothing emits."""
+    """Return the function ``area_count(scene) -> int``: number of terms of (1) or of point lights, 0 for none."""
 
     @wp.func(name=f"area_count_{samples}", module="unique")
     def area_count(scene: RayScene) -> wp.int32:
@@ -402,7 +402,7 @@ def lobe_solid_angle(surface: Surface) -> wp.float32:
 
 @wp.func
 def looks_by_lobe(shape: Shape, point: wp.vec3, lobe: wp.float32) -> wp.bool:
-    """Return whether an emitting object is sampled by rays into the lobe (solid angle ``lobe``), not by points."""
+    """Return whether the solid angle ``lobe`` is less than an emitting object's: then rays into the lobe sample it."""
     away = shape.position - point
     square = wp.dot(away, away)
     radius = area_radius(shape)
@@ -414,7 +414,7 @@ def looks_by_lobe(shape: Shape, point: wp.vec3, lobe: wp.float32) -> wp.bool:
 
 @wp.func
 def draw_lobe(surface: Surface, normal: wp.vec3, wo: wp.vec3, u: wp.vec2) -> wp.vec3:
-    """Return a unit direction sampled from a surface's lobe by ``u``, a point of the unit square."""
+    """Return a unit direction toward the light, sampled from a surface's lobe by ``u``, a point of the unit square."""
     if surface.model == PHONG:
         return frame_from_normal(reflect(wo, normal)) * sample_phong_lobe(u, surface.shininess)
     if surface.model == METALLIC_ROUGHNESS:
@@ -440,7 +440,7 @@ def lobe_weight(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> 
 
 @wp.func
 def without_lobe(surface: Surface) -> Surface:
-    """Return the surface with its diffuse reflection alone."""
+    """Return a copy of the surface that reflects diffusely alone."""
     result = surface
     result.reflectance = wp.vec3(0.0)
     result.f0 = wp.vec3(0.0)
@@ -450,10 +450,10 @@ def without_lobe(surface: Surface) -> Surface:
 
 @functools.cache
 def make_area_reflection(trace: TraceConfig, samples: int) -> wp.Function:
-    """``area_reflection(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: emitters in narrow lobes.
+    """Return the function ``area_reflection(scene, hit, surface, normal, geometric, wo, turn) -> vec3``.
 
-    It is the radiance toward ``wo`` of objects for which ``looks_by_lobe`` holds, by ``samples`` rays, or one for a
-    mirror.
+    Its result is the radiance reflected toward ``wo`` from objects for which ``looks_by_lobe`` holds, found by
+    ``samples`` rays, or by one for a mirror.
     """
     functions = make_trace(trace)
     closest_object, occluded_by_proxies = functions.closest_object, functions.occluded_by_proxies

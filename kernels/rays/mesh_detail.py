@@ -68,7 +68,7 @@ def is_there(
 def intersect_solid(
     scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, sided: wp.bool
 ) -> Contact:
-    """Return the closest triangle of a mesh that stops a ray; up to ``MOST_LAYERS`` triangles are crossed.
+    """Return the ``Contact`` with the closest triangle of a mesh that stops a ray; ``MOST_LAYERS`` may let it pass.
 
     A ray continues a little behind a face that it passed, by more than rounding, so that it does not meet the same face
     again.

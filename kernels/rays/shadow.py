@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 MIN_DISTANCE = wp.constant(wp.float32(1.0e-4))
 
 PROBE_RAYS = 8
-"""Rays to the rim and the centre of a light with a radius; if all agree, it counts as wholly visible or hidden."""
+"""Rays to rim and centre of a light with a radius; if all agree, the light counts as wholly visible or hidden."""
 SOFT_RAYS = 32
 """Rays to a light that is partly hidden."""
 GOLDEN_ANGLE = wp.constant(wp.float32(math.pi * (3.0 - math.sqrt(5.0))))
@@ -60,7 +60,7 @@ def spot_falloff(light: Light, wi: wp.vec3) -> wp.float32:
 
 @functools.cache
 def make_sample_light(kinds: tuple[int, ...]) -> wp.Function:
-    """``sample_light(light, point) -> LightSample`` for the given kinds of light."""
+    """Return the function ``sample_light(light, point) -> LightSample`` for the given kinds of light."""
     label = "_".join(map(str, kinds))
     positional = POINT in kinds or SPOT in kinds
 
@@ -103,7 +103,7 @@ sample_light = make_sample_light(ALL_LIGHTS)
 
 @functools.cache
 def make_shadow(config: TraceConfig) -> wp.Function:
-    """``is_lit(scene, point, geometric_normal, error, sample) -> bool`` for the kinds of shape in ``config``.
+    """Return the function ``is_lit(scene, point, geometric_normal, error, sample) -> bool``: a light is not hidden.
 
     ``point``, ``geometric_normal`` and ``error`` are those of a ``Hit``. A light at distance 0 or below the offset is
     never hidden.
@@ -123,18 +123,19 @@ def make_shadow(config: TraceConfig) -> wp.Function:
 
 @wp.func
 def has_penumbra(light: Light, sample: LightSample) -> wp.bool:
-    """Return whether a light has penumbrae around the point of a sample."""
+    """Return whether a light casts shadows with penumbrae at the point of a sample: its radius does not enclose it."""
     return light.radius > 0.0 and light.kind != DIRECTIONAL and sample.distance > light.radius
 
 
 @functools.cache
 def make_visible_share(config: TraceConfig) -> wp.Function:
-    """``visible_share(scene, point, geometric_normal, error, light, sample, turn) -> float32``: 0 hidden .. 1 seen.
+    """Return the function ``visible_share(scene, point, geometric_normal, error, light, sample, turn) -> float32``.
 
-    A light with a radius is a disk that faces the point. Its centre and rim are tested first. Only in a penumbra is the
-    full sunflower pattern of rays traced, each of which stands for the same area of the disk. ``turn`` rotates the
-    pattern, in turns: if it differs between the pixels of a small tile, the steps of 1 / ``SOFT_RAYS`` become a fine
-    grain. A light without radius, or one that encloses the point, is visible or not, as in ``make_shadow``.
+    Its result is the share, 0..1, of a light that is visible from a point. A light with a radius is a disk that faces
+    the point. Its centre and rim are tested first. Only in a penumbra is the full sunflower pattern of rays traced,
+    each of which stands for the same area of the disk. ``turn`` rotates the pattern, in turns: if it differs between
+    the pixels of a small tile, the steps of 1 / ``SOFT_RAYS`` become a fine grain. A light without radius, or one that
+    encloses the point, is visible (1) or not (0).
     """
     is_lit = make_shadow(config)
     occluded = make_trace(config).occluded

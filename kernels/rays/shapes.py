@@ -21,9 +21,9 @@ from warp_ar.kernels.structs import BOX, MESH, Hit, RayScene, Shape
 wp.set_module_options({"enable_backward": False})
 
 FACES = wp.constant(8)
-"""Number of values of ``surface_key`` that each proxy has."""
+"""Number of keys of each proxy: ``surface_key`` is its index times this number, plus the number of the face."""
 MESH_KEY = wp.constant(7)
-"""Remainder of a mesh's ``surface_key`` by ``FACES``."""
+"""Number of the face in the ``surface_key`` of a mesh, which has one key for all its faces."""
 # Half the spacing of float32 at 1: the relative error of one rounding.
 ROUNDING = wp.constant(wp.float32(2.0**-24))
 FAR = wp.constant(wp.float32(3.0e38))
@@ -165,7 +165,7 @@ def enter_mesh(half: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.float32
 # most two radii.
 @wp.func
 def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Contact:
-    """Return the closest triangle of a mesh, hit from either side; the test is watertight."""
+    """Return the ``Contact`` with the closest triangle of a mesh, hit from either side; the test is watertight."""
     contact = Contact()
     contact.t = FAR
     start = enter_mesh(shape.extent, origin, direction)

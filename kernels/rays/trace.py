@@ -69,7 +69,7 @@ def offset_origin(point: wp.vec3, geometric_normal: wp.vec3, direction: wp.vec3,
 
 
 class Trace(NamedTuple):
-    """Functions for kernels, each taking ``(scene: RayScene, origin: vec3, direction: vec3, t_max: float32)``."""
+    """Functions that trace rays in kernels, with arguments ``(scene, origin, direction, t_max)``."""
 
     closest_object: wp.Function
     """Returns the ``Hit`` of the closest virtual object."""
@@ -103,7 +103,7 @@ class TraceConfig:
 
 @functools.cache
 def _ways(stretched: bool) -> tuple[wp.Function, wp.Function, wp.Function]:
-    """Return functions that map points and vectors into a shape's coordinates, and normals out of them."""
+    """Return functions that map points and vectors into a shape's coordinates, and normals from these to the world."""
     if stretched:
         return to_local_point, to_local_vector, to_world_normal
     return to_rigid_point, to_rigid_vector, to_rigid_normal

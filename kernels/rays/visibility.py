@@ -30,13 +30,16 @@ class VisibleObjects:
 
 @wp.func
 def inside_rect(row: wp.int32, column: wp.int32, rect: wp.vec4i) -> wp.bool:
-    """Return whether a pixel lies in a rectangle (row_start, row_stop, column_start, column_stop)."""
+    """Return whether a pixel lies in a rectangle (row_start, row_stop, column_start, column_stop), stops excluded."""
     return row >= rect[0] and row < rect[1] and column >= rect[2] and column < rect[3]
 
 
 @functools.cache
 def make_primary(config: TraceConfig) -> wp.Function:
-    """``closest_visible(scene, origin, direction) -> Hit``: the closest object if no proxy hides it, else shape -1."""
+    """Return the function ``closest_visible(scene, origin, direction) -> Hit``.
+
+    Its result is the closest object, if no proxy hides it, else a hit of shape -1.
+    """
     trace = make_trace(config)
     closest_object, occluded_by_proxies = trace.closest_object, trace.occluded_by_proxies
 
@@ -55,7 +58,7 @@ def make_primary(config: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_visible_proxy(config: TraceConfig) -> wp.Function:
-    """``visible_proxy(params, ray, scene, probes) -> Hit``: the proxy that a pixel shows, or shape -1.
+    """Return the function ``visible_proxy(params, ray, scene, probes) -> Hit``: the proxy in a pixel, or shape -1.
 
     A proxy that is seen from behind, or hidden by a mirror ball, does not count.
     """

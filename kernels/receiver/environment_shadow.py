@@ -75,7 +75,7 @@ MAX_QUEUE = 1 << 24
 MAX_PARTIALS = 8
 """Largest number of CUDA threads that share a cell's samples, each with a partial sum."""
 ENOUGH_THREADS = 1 << 20
-"""Number of threads from which more threads per cell are slower: each thread repeats the cell's set-up and culling."""
+"""Number of threads from which more threads per cell are slower: each thread repeats the culling of its cell."""
 QUEUE_THREADS = 1 << 17
 """Threads that trace the queue; each takes every ``QUEUE_THREADS``-th ray."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
@@ -129,7 +129,7 @@ class ShadowCells:
 
     stride: wp.int32  # pixels along a cell
     ratio: wp.array2d[wp.vec4]  # RGB share of the environment that is not hidden, and depth
-    bounced: wp.array2d[wp.vec3]  # light of objects there, relative to the environment's
+    bounced: wp.array2d[wp.vec3]  # irradiance by light from objects, over the environment's
     surface: wp.array2d[wp.int32]  # key of the surface that the cell shows; -1: none, and ratio is not valid
     filtered: wp.array2d[wp.vec3]  # factor on the frame; written only where a surface is seen
 
@@ -209,7 +209,10 @@ def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
 
 @functools.cache
 def make_mask_cone(count: int, emitters: bool) -> wp.Function:
-    """``mask_cone(sets, first, point, to_center, radius) -> uint64``: mask of samples in a sphere's direction."""
+    """Return the function ``mask_cone(sets, first, point, to_center, radius) -> uint64``.
+
+    Its result has one bit for each of ``count`` samples: 1 if the ray from ``point`` toward it may meet the sphere.
+    """
 
     @wp.func(module="unique")
     def mask_cone(
@@ -292,7 +295,7 @@ class SampleRay:
 
 @functools.cache
 def make_aim(emitters: bool, several: bool = False) -> wp.Function:
-    """``aim(sets, places, index, hit) -> SampleRay``: ray from ``hit`` toward sample ``index``, its origin not set.
+    """Return the function ``aim(sets, places, index, hit) -> SampleRay``: ray from ``hit`` to a sample, without origin.
 
     ``places`` holds the balls' positions, and is read if ``several``.
     """
@@ -318,7 +321,7 @@ def make_aim(emitters: bool, several: bool = False) -> wp.Function:
 
 @wp.struct
 class Sender:
-    """Radiance along a sample's direction without virtual objects, and its source's distance."""
+    """Radiance that arrives along a sample's direction without virtual objects, and its source's distance, metres."""
 
     radiance: wp.vec3
     distance: wp.float32
@@ -326,10 +329,10 @@ class Sender:
 
 @functools.cache
 def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
-    """``find_sender(params, picture, scene, distant, sets, index, ray, by_proxy, by_ball) -> Sender``.
+    """Return ``find_sender(params, picture, scene, distant, sets, index, ray, by_proxy, by_ball) -> Sender``.
 
-    The source is the first proxy (sought if ``by_proxy``) or mirror ball (sought if ``by_ball``) on the ray, else the
-    sample of the environment.
+    The sender is the source of the light that arrives along ``ray``: the first proxy (sought if ``by_proxy``) or mirror
+    ball (sought if ``by_ball``) on the ray, else sample ``index`` of the environment.
     """
     closest_proxy = make_trace(config.distant.trace).closest_proxy
     traced = config.bounce == "traced"
@@ -664,7 +667,10 @@ def reduce_cells_kernel(
     # Out:
     cells_out: ShadowCells,
 ):
-    """Add a cell's partial sums in the order of the samples, so that every run gives the same bits."""
+    """Write a cell's ratio and bounced light from its partial sums, added in the order of the samples.
+
+    So every run gives the same bits.
+    """
     i, j = wp.tid()
     if queue.spans[0, i, j][1] < 0:
         return

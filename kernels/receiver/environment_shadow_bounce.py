@@ -1,13 +1,13 @@
 """Light that virtual objects reflect to the receiver, along a ray that met an object.
 
-Method ``traced`` sends a further ray into one of the object's two lobes, picked by their reflectance. The diffuse lobe
+Method ``traced`` sends another ray into one of the object's two lobes, picked by their reflectance. The diffuse lobe
 gives albedo E(n) / pi, times a factor by the first surface on the ray: 1 for none; for another object, its colour; for
 the receiver, 1 if a ray from there leaves the scene, else a share of the object's reflectance. So light between an
 object and the ground falls off with each reflection, the more slowly the whiter the object. The glossy lobe gives the
 radiance in the mirror direction.
 
-Method ``estimated`` needs no further ray. Both lobes reflect the distant environment, in which the receiver replaces
-the half-space behind the cell's own surface. Let h be the share of the cell's light that objects hide, u the light that
+Method ``estimated`` needs no other ray. Both lobes reflect the distant environment, in which the receiver replaces the
+half-space behind the cell's own surface. Let h be the share of the cell's light that objects hide, u the light that
 objects reflect of the environment, and d the light that they would reflect of an unshaded receiver. The receiver that
 objects reflect is near the cell and shaded like it, so the ratio r satisfies
 
@@ -62,7 +62,7 @@ MAX_BRIGHTNESS = wp.constant(wp.float32(2.0))
 An emitter may light a small part of an object that few samples meet: brighter values would show as specks.
 """
 FURTHER = wp.constant(wp.float32(0.5))
-"""Factor on the light of an object close above the receiver: half of what lights the object is its own shadow."""
+"""Factor on the light that a shaded receiver reflects to an object above it: half of it is lost in the shadow."""
 
 
 @wp.func
@@ -110,7 +110,7 @@ class ReflectedLight:
 
 @wp.struct
 class Before:
-    """Light of the hemisphere above a cell's surface, for estimates without a further ray."""
+    """Light in the hemisphere above a cell's surface; the method ``estimated`` finds the light of objects from it."""
 
     up: wp.vec3  # the surface's normal, on the side that light comes from
     from_receiver: wp.vec3  # irradiance of a surface that faces the receiver
@@ -120,7 +120,7 @@ class Before:
 
 @functools.cache
 def make_look_wide(config: DistantLightConfig) -> wp.Function:
-    """``look_wide(environment, point, direction) -> vec3``: radiance of the environment, blurred to suit few rays.
+    """Return the function ``look_wide(environment, point, direction) -> vec3``: blurred radiance of the environment.
 
     Emitters are in the directions in which the balls show them.
     """

@@ -47,7 +47,7 @@ def window_weight(offset: wp.int32, reach: wp.int32) -> wp.float32:
 
 @functools.cache
 def make_filter_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
-    """Kernel of ``filter_ratio``."""
+    """Return the kernel of ``filter_ratio`` for the given configuration."""
     wide, narrow = config.side // 2, config.side // 4
     width = 2 * wide + 1
 

@@ -63,7 +63,7 @@ wp.set_module_options({"enable_backward": False})
 LOBE_REACH = wp.constant(wp.float32(14.0))
 """Largest tangent of a half vector's angle, over alpha, that is considered: 0.5 % of GGX's energy lies beyond."""
 MIRROR_ALPHA = wp.constant(wp.float32(1.0e-3))
-"""Lobe width alpha below which a receiver is a mirror, with one direction per pixel."""
+"""Lobe width alpha below which a receiver is a mirror: it reflects each camera ray in one direction."""
 EDGE_SAMPLES = 4
 """Rays per pixel of a mirror, to anti-alias edges of its image."""
 MOST_RADIANCE = wp.constant(wp.float32(8.0))
@@ -148,7 +148,7 @@ class Reflected:
 
 @functools.cache
 def make_follow(config: GlossConfig) -> wp.Function:
-    """``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Reflected``: radiance along one ray.
+    """Return the function ``follow(params, sight, lights, hit, wi, weight, width, asked, turn) -> Reflected``.
 
     The ray leaves ``hit`` along ``wi`` and represents a lobe of width alpha ``width``. ``Reflected.before`` is always
     found if ``asked``, else only if an object is met.
@@ -233,7 +233,7 @@ def make_follow(config: GlossConfig) -> wp.Function:
 def sphere_over_point(
     normal: wp.vec3, half: wp.vec3, cos_d: wp.float32, roughness: wp.float32, reach: wp.float32
 ) -> wp.float32:
-    """Return a spherical light's highlight over that of a point light of the same irradiance at its centre.
+    """Return the ratio of a spherical light's highlight to that of a point light of equal irradiance at its centre.
 
     ``half`` is the half vector, ``cos_d`` its cosine with the ray, ``reach`` the sphere's radius over its distance.
     """
@@ -252,7 +252,7 @@ def sphere_over_point(
 
 @functools.cache
 def make_highlights(config: GlossConfig) -> wp.Function:
-    """``highlights(sight, lights, surface, hit, wo, turn) -> vec3``: specular radiance of virtual lights at a hit."""
+    """Return the function ``highlights(sight, lights, surface, hit, wo, turn) -> vec3``: virtual lights' highlights."""
     sample_light = make_sample_light(config.lights)
     visible_share = make_visible_share(config.trace)
 

@@ -116,7 +116,7 @@ def meets_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool
 
 @functools.cache
 def make_mean_facing(config: RelightConfig) -> wp.Function:
-    """``mean_facing(receiver, point, normal) -> vec3``: cosine-weighted mean radiance above a surface.
+    """Return the function ``mean_facing(receiver, point, normal) -> vec3``: mean radiance above a surface, by cosine.
 
     Emitters keep the directions in which the balls show them.
     """
@@ -162,7 +162,7 @@ class Hider:
 
 @functools.cache
 def make_find_hider(config: RelightConfig) -> wp.Function:
-    """``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``: obstacle before a sample.
+    """Return ``find_hider(params, scene, receiver, hit, toward, solids) -> Hider``, which finds what hides a sample.
 
     ``toward`` leads to the sample; ``solids`` is the result of ``bound_solids``.
     """
@@ -220,7 +220,7 @@ def is_shone_on(lights: wp.array[Light], hit: Hit) -> wp.bool:
 
 @functools.cache
 def make_ambient_visibility_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel of ``estimate_ambient_visibility``."""
+    """Return the kernel of ``sum_ambient_light`` for the given configuration."""
     visible_cell = make_visible_cell(config.trace)
     find_hider = make_find_hider(config)
 
@@ -289,7 +289,7 @@ def add_parts_kernel(
     # Out:
     cells_out: SurfaceCells,
 ):
-    """Compute ambient visibility from a cell's sums, added in a fixed order; cells that are kept stay as they are."""
+    """Compute a cell's ambient visibility from its sums, in a fixed order; if ``bounced``, cells without sums stay."""
     ci, cj = wp.tid()
     ci += row_start
     surface = parts[ci, cj, 0].surface
@@ -307,7 +307,7 @@ def add_parts_kernel(
 
 @functools.cache
 def make_area_light_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel of ``estimate_area_light``."""
+    """Return the kernel of ``estimate_area_light`` for the given configuration."""
     visible_cell = make_visible_cell(config.trace)
     area_response = make_area_response(dataclasses.replace(config, method="flat"))
 
@@ -379,7 +379,7 @@ def make_sent_by_object(trace: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_send_light_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel of ``send_light``."""
+    """Return the kernel of ``send_light`` for the given configuration."""
     visible_cell = make_visible_cell(config.trace)
     direct_lighting = make_direct_lighting(dataclasses.replace(config, bounced=False))
     has_objects = bool(config.trace.objects)
@@ -460,7 +460,7 @@ def list_patches_kernel(
 
 @functools.cache
 def make_gather_light_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel of ``gather_light``."""
+    """Return the kernel of ``gather_light`` for the given configuration."""
     visible_cell = make_visible_cell(config.trace)
     mean_facing = make_mean_facing(config)
 
@@ -530,7 +530,7 @@ find_ambient_visibility = row_launcher(add_parts_kernel, like=lambda *given: giv
 
 Args:
     parts: (r, c, n) from ``sum_ambient_light``.
-    bounced: As there; other cells keep their values.
+    bounced: True if ``parts`` are of cells that only bounced light reaches; other cells keep their values.
     cells_out: Cells of ambient visibility.
 """
 
@@ -551,11 +551,11 @@ send_light = row_launcher(make_send_light_kernel)
 """Find the virtual light that every patch (block of pixels of the receiver) reflects.
 
 Args:
-    config: As for ``estimate_ambient_visibility``.
+    config: Kinds of shape, form of the environment's irradiance.
     params: (1,) FrameParams: camera and light_rect.
     scene: Objects and proxies.
     lights: (n,) Light.
-    receiver: From ``make_receiver``, with the cells of ``estimate_ambient_visibility`` where the config has them.
+    receiver: From ``make_receiver``, with the cells of ``find_ambient_visibility`` where the config has them.
     stride: Pixels along a patch.
     patches_out: (ceil(H / stride), ceil(W / stride)) patches; those that reflect nothing have area 0.
 """
@@ -575,7 +575,7 @@ gather_light = row_launcher(make_gather_light_kernel, like=lambda *given: given[
 """Sum the irradiance that patches send to each cell of the receiver.
 
 Args:
-    config: As for ``estimate_ambient_visibility``.
+    config: Kinds of shape, form of the environment's irradiance.
     params: (1,) FrameParams: camera and light_rect.
     scene: Proxies.
     receiver: From ``make_receiver``: picture, balls and the environment's irradiance.

@@ -55,9 +55,9 @@ wp.set_module_options({"enable_backward": False})
 
 _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
 _MASKED = 8
-"""Number of lights that have their own shadow bit in the visibility that ``relight`` writes for ``smooth_edges``."""
+"""Number of lights with a bit of their own, 1 if the light is hidden, in the ``visibility`` that ``relight`` writes."""
 _LIT = wp.constant(1 << _MASKED)
-"""Bit of the visibility that is set if any virtual light arrives; the higher bits hold the key of the surface."""
+"""Bit of ``visibility`` that is set if any virtual light arrives; higher bits hold the ``surface_key``."""
 _SURFACE = wp.constant(_MASKED + 1)
 _NOTHING = wp.constant(-1 << (_MASKED + 1))
 _BALL = wp.constant(-2 << (_MASKED + 1))
@@ -73,7 +73,7 @@ class DirectLighting:
 
 @functools.cache
 def make_area_response(config: RelightConfig) -> wp.Function:
-    """``area_response(scene, receiver, hit, matter, turn)``: E_v visible response, summed over emitting objects."""
+    """Return ``area_response(scene, receiver, hit, matter, turn)``: the sum of E_v response over emitting objects."""
     is_lit, respond = make_shadow(config.trace), make_respond(config.method)
     area_count, area_sample = make_area_count(config.area_samples), make_area_sample(config.area_samples)
 

@@ -151,7 +151,7 @@ Args:
 
 @wp.func
 def add_to_rank(ranks: vec8, found: wp.int32, share: wp.float32) -> vec8:
-    """Return ``ranks`` with ``share`` added to the surface ``found``, which is dropped if no rank is free."""
+    """Return ``ranks``, pairs of surface and share, with ``share`` added to that of ``found``, if a pair is free."""
     out = ranks
     taken = bool(found < 0)
     for k in range(wp.static(RANKS)):

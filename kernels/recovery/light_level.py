@@ -1,4 +1,4 @@
-"""Level of recovered light: its radiance now over its radiance in the estimate's frame, measured on the card.
+"""Level of recovered light: its radiance now over that in the estimate's frame, measured on the printed white card.
 
 An estimate of clipped light takes effect some frames after the frame from which it was made, and the next follows later
 still. A lamp may be dimmed in between and still clip in the ball. Let E be the irradiance of the card, e the part of it
@@ -28,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 STILL = wp.constant(wp.float32(0.01))
 """Relative change of the card's light up to which the level stays."""
 FOLLOWED = wp.constant(wp.float32(0.03))
-"""Relative change from which the level follows the card in full."""
+"""Relative change of the card's light from which the level follows it in full."""
 LEAST_SHARE = wp.constant(wp.float32(0.1))
 """Least share s of the card's light that the map lacks; a smaller one is within the map's error."""
 LEAST_POINTS = wp.constant(wp.int32(8))
@@ -36,10 +36,10 @@ LEAST_POINTS = wp.constant(wp.int32(8))
 AGREEING = wp.constant(wp.float32(0.7))
 """Least share of the card's points whose ratio of radiance agrees with the median."""
 SPREAD = wp.constant(wp.float32(0.1))
-"""Largest relative difference from the median at which a ratio agrees with it."""
+"""Largest relative difference from the median at which a point's ratio of radiance agrees with it."""
 MOST = wp.constant(wp.float32(2.5))
-"""Highest level: a lamp comes back that was dimmed to 40 % in the estimate's frame. A larger rise is probably another
-lamp."""
+"""Highest level: that of a lamp that was dimmed to 40 % in the estimate's frame and is now at full power. A larger rise
+is probably due to another lamp."""
 DARK = wp.constant(wp.float32(0.0016))
 """Radiance below which a point is not used, because of quantisation."""
 
@@ -71,7 +71,7 @@ def add_rows_kernel(
     # Out:
     upward_out: wp.array[wp.float32],
 ):
-    """Sum the irradiance of all rows, from the first to the last."""
+    """Sum the irradiance of all rows to that of the whole map, in the order of the rows."""
     c = wp.tid()
     total = wp.float32(0.0)
     for i in range(rows.shape[0]):
@@ -111,7 +111,7 @@ def follow_level_kernel(
     # Out:
     level_out: wp.array[wp.float32],
 ):
-    """Write the level of one channel; only the thread of the point with the median ratio writes."""
+    """Write the level of one channel; only the thread whose point has the median ratio of radiance writes."""
     c, own = wp.tid()
     change = change_of(now[own], then[own], c)
     unseen = share[c]
@@ -147,7 +147,7 @@ def follow_level(
         now: Radiance of the card's points in the current frame, ``Observation`` (n).
         then: Their radiance in the estimate's frame, ``Observation`` (n).
         upward: From ``sum_upward``, now and then.
-        share: Share s of the card's light then that the map lacks, by channel, float32 (3).
+        share: Share s of the card's light in the estimate's frame that the map lacks, by channel, float32 (3).
         level_out: Radiance of recovered light over that of the estimate, by channel, float32 (3).
     """
     launch(follow_level_kernel, (3, now.shape[0]), [now, then, *upward, share], [level_out], block_dim=32)

@@ -27,9 +27,9 @@ LOST = 0.02
 """Clipped share from which on a cell belongs to a clipped region, and its missing light is that of clipped texels."""
 _LOST = wp.constant(wp.float32(LOST))
 BEYOND = wp.constant(wp.float32(0.25))
-"""Share of a cell's clipped texels beyond proxies from which on its clipped texels on proxies show the same light."""
+"""Share of a cell's clipped light beyond all proxies from which on its clipped texels on proxies are left out."""
 MOST_LEFT = wp.constant(wp.float32(4.0))
-"""Largest factor on the recovered radiance of clipped texels if fewer texels of the cell clip than before."""
+"""Largest factor on a cell's recovered radiance if fewer of its texels clip than in the frame of the estimate."""
 
 
 @wp.struct
@@ -53,7 +53,7 @@ def cell_shape(height: int, width: int) -> tuple[int, int]:
 
 @wp.func
 def trust(confidence: wp.float32) -> wp.float32:
-    """Return the degree to which a texel counts as observed, 0..1; 0 for NaN."""
+    """Return the degree, 0..1, to which a texel of this confidence counts as observed; 0 for NaN."""
     t = wp.clamp(confidence / FULL_TRUST, 0.0, 1.0)
     return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
 
@@ -73,7 +73,7 @@ def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         # Out:
         missing_out: wp.array2d[wp.vec3],
     ):
-        """Write 0 for the texels of one cell that are left out."""
+        """Write 0 for the texels of one cell that are left out: they clip by light from behind a proxy's edge."""
         band_row, column = wp.tid()
         row = row_start + band_row
         height = clipped.shape[0]
@@ -222,7 +222,7 @@ def add_recovered_kernel(
     # Out:
     recovered_out: wp.array2d[wp.vec3],
 ):
-    """Add to one texel its share of its cell's recovered radiance."""
+    """Add a cell's recovered radiance to its texels, to each in proportion to its share that lacks light."""
     band_row, column = wp.tid()
     row = row_start + band_row
     height = radiance.shape[0]

@@ -60,7 +60,7 @@ def relocate_kernel(
     # Out:
     environment_out: wp.array2d[wp.vec3],
 ):
-    """Write one texel if the position of an emitter is known; else do nothing."""
+    """Write one texel of the other ball's map if an emitter's position is known: light is moved by its parallax."""
     i, j = wp.tid()
     i += row_start
     if not any_near(emitters):
@@ -134,7 +134,7 @@ def share_recovered_kernel(
     # Out:
     environment_out: wp.array2d[wp.vec3],
 ):
-    """Write one texel if the position of no emitter is known."""
+    """Write one texel of the other ball's map, with its part of the recovered energy, unless ``relocate`` writes it."""
     i, j = wp.tid()
     i += row_start
     if any_near(emitters):
@@ -166,7 +166,7 @@ def move_emitters_kernel(
     # Out:
     emitters_out: wp.array[Emitter],
 ):
-    """Write one emitter with its direction and distance from another ball."""
+    """Write one emitter with its direction, distance and power seen from another ball."""
     k = wp.tid()
     place = places[ball]
     emitters_out[k] = seen_from(emitters[k], wp.vec3(place[0], place[1], place[2]))
@@ -187,14 +187,14 @@ Args:
 
 
 send_recovered = row_launcher(send_recovered_kernel)
-"""Compute the energy that each cell of the first ball's map gives per unit of weighted missing share in another map.
+"""Compute the factors e_k / (sum of a' s' w_k), by which cells of the first ball's map light another ball's texels.
 
 Args:
     share: (h, w) missing share in the other map, from ``weigh_boundaries``.
     confidence: (h, w) confidence of its texels.
     cells: (rows, columns) ``Cell`` of the first ball's map, of the frame from which light was recovered.
     recovered: (rows, columns) radiance that a wholly clipped texel of each cell lacks.
-    sent_out: (rows, columns) ``wp.vec3``.
+    sent_out: (rows, columns) ``wp.vec3``; -1 in channels whose energy keeps its direction.
 """
 
 
