@@ -25,7 +25,6 @@ from warp_ar.signals import (
     PQ_WHITE,
     REC_709,
     REC_2020,
-    converted,
     hlg_of_light,
     light_of_hlg,
     light_of_pq,
@@ -130,10 +129,3 @@ def test_primaries_are_those_that_recommendations_print() -> None:
         np.testing.assert_allclose(rgb_from_rgb(source, REC_709) @ np.ones(3), 1.0, rtol=FLOAT64)
         back = rgb_from_rgb(REC_709, source) @ rgb_from_rgb(source, REC_709)
         np.testing.assert_allclose(back, np.eye(3), atol=FLOAT64)
-
-
-def test_pictures_are_converted_pixel_by_pixel() -> None:
-    picture = np.random.default_rng(3).uniform(0.0, 4.0, (5, 7, 3))
-    expected = np.einsum("ij,hwj->hwi", rgb_from_rgb(REC_2020, REC_709), picture)
-    np.testing.assert_allclose(converted(picture, REC_2020, REC_709), expected, atol=1e-5)
-    np.testing.assert_array_equal(converted(picture, REC_709, REC_709), picture.astype(np.float32))

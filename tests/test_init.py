@@ -80,27 +80,6 @@ def test_pdf_prints_at_true_scale(paper, size, tmp_path):
     assert abs(dark[:, :60].sum(0).max() / 4 - 100) < 1
 
 
-def test_everything_on_the_sheet_is_where_it_says(tmp_path):
-    """Greys and the ball's cross, looked up by the board's own frame."""
-    per_metre = 5000
-    page = card_layout.draw_page((0.21, 0.297), per_metre, draw_card(card_layout.CARD_MARKER, per_metre))
-    row, column = np.array(page.shape) / 2  # the sheet's width is even about the board
-    marker = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)).detectMarkers(page)
-    by_number = {int(n): c[0] for n, c in zip(np.ravel(marker[1]), marker[0], strict=True)}
-    # Markers 0 and 9 stand at squares (1, 0) and (4, 3): the board's frame follows from two of them.
-    a, b = by_number[0].mean(0), by_number[9].mean(0)
-    origin = a + (b - a) * (1.0 / 3.0) + np.array([0.0, 0.5 / 3.0]) * (b - a)[1]
-    assert np.allclose(b - a, [3 * 0.032 * per_metre, 3 * 0.032 * per_metre], atol=2)
-    for share, (x, y, _) in zip(card_layout.GREYS, card_layout.grey_centers(), strict=True):
-        column, row = np.round(origin + np.array([x, -y]) * per_metre).astype(int)
-        assert page[row - 15 : row + 15, column - 50 : column + 50].mean() / 255 == pytest.approx(1 - share, abs=0.04)
-    x, y = card_layout.BALL_PLACE
-    column, row = np.round(origin + np.array([x, -y]) * per_metre).astype(int)
-    # Lines of a pixel, which rounding may move by one.
-    assert (page[row - 1 : row + 2, column - 15 : column + 16].min(0) == 0).all()
-    assert (page[row - 15 : row + 16, column - 1 : column + 2].min(1) == 0).all()
-
-
 @pytest.mark.parametrize(
     "marker",
     [

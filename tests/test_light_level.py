@@ -179,12 +179,6 @@ def test_light_that_changes_slowly_runs_ahead_by_no_more_than_counts(rate):
         assert found.recovered.mean() > (1.0 - 1.1 * STILL_steadiness) * level
 
 
-def test_without_surfaces_nothing_is_averaged():
-    steadiness = Steadiness()
-    steadiness.follow(estimate(1.0), seen(), VIEW)
-    assert steadiness.follow(estimate(2.0), seen(told=False), VIEW).recovered.max() == 2.0
-
-
 # What clips is raised, where nothing but the map tells, by how much clips, how many channels do, and how it ends.
 
 
@@ -381,24 +375,6 @@ def test_one_lamp_goes_where_the_other_ball_sees_it_with_all_its_light(device):
     assert not found.any()
 
 
-def test_of_two_lamps_each_goes_to_the_nearest(device):
-    lamps = [((3, 20), 0.2, 30.0), ((9, 2), 0.8, 5.0)]
-    places = [(16, 80), (36, 12)]
-    found = shared(clips=[(place, 1.0) for place in places], lamps=lamps)
-    directions, toward = latlong.directions(*CELLS), latlong.directions(HEIGHT, 2 * HEIGHT)
-    area, solid = latlong.solid_angles(HEIGHT, 2 * HEIGHT), latlong.solid_angles(*CELLS)
-    expected = np.zeros(2)
-    for cell, share, radiance in lamps:
-        near = np.array([1.0 / (((toward[at] - directions[cell]) ** 2).sum() + 0.04) ** 2 for at in places])
-        own = near * [area[at] for at in places]
-        expected += share * radiance * solid[cell] * near / own.sum()
-    np.testing.assert_allclose([found[at][0] for at in places], expected, rtol=1e-5)
-    alone = [
-        share * radiance * solid[cell] / area[at] for (cell, share, radiance), at in zip(lamps, places, strict=True)
-    ]
-    assert (np.abs(expected / alone - 1.0) < 0.05).all()
-
-
 def test_what_the_first_ball_does_not_see_is_far(device):
     """Light that was found where it sees nothing stays in its direction."""
     excess = np.zeros((HEIGHT, 2 * HEIGHT, 3))
@@ -408,29 +384,3 @@ def test_what_the_first_ball_does_not_see_is_far(device):
     found = shared(clips=[((40, 40), 1.0)], lamps=lamps, hidden=[(3, 20)], excess=excess)
     np.testing.assert_array_equal(found[12:16, 80:84], 7.0)
     assert found.sum() == found[12:16, 80:84].sum()
-
-
-def test_where_an_emitter_has_a_place_its_light_is_turned_and_else_nothing_is(device):
-    """Of two passes over one map exactly one writes."""
-    far = emitter_records({"origin": HERE, "direction": (0.0, 0.6, 0.8), "distance": np.inf, "power": (1.0,) * 3})
-    _, captured, environment = maps(np.array([0.0, -0.6, 0.8]))
-    for emitters, near in ((emitter_records(lamp()), True), (far, False), (emitter_records(), False)):
-        assert (shared(clips=[], lamps=[], emitters=emitters) == -1.0).all() == near
-        assert (moved(environment, captured, captured, emitters) == 0.0).all() != near
-
-
-def test_another_emitter_is_another_light():
-    steadiness = Steadiness()
-    steadiness.follow(estimate(1.0, power=1.0), seen(), VIEW)
-    assert steadiness.follow(estimate(2.0, power=2.0, cell=4), seen(), VIEW).emitters[0].power[0] == 2.0
-    found = steadiness.follow(estimate(4.0), seen(), VIEW)
-    assert found.emitters == ()
-    assert found.recovered.max() == 4.0
-
-
-def test_cells_that_begin_or_cease_to_clip_are_as_they_are_now():
-    steadiness, before, now = Steadiness(), estimate(4.0), estimate(2.0)
-    before.recovered[0], now.recovered[1] = 0.0, 0.0
-    steadiness.follow(before, seen(), VIEW)
-    recovered = steadiness.follow(now, seen(), VIEW).recovered
-    np.testing.assert_array_equal(recovered[:, 0, 0], [2.0, 0.0, 3.0, 3.0])

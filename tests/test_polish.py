@@ -17,39 +17,37 @@ from warp_ar.scene import ProxyMaterial, dumps_scene, load_scene
 pytestmark = pytest.mark.slow
 
 TABLE = decode_table("srgb")
-SPOILED = {
-    "as it is": None,
-    "exposure that drifts": lambda linear, number: linear * 0.8 ** (number % 3),
-}
+POLISHED = 6, 0.15, 0.04
+"""Seed, roughness and reflectance of a table."""
 
 
 def estimate(made, views=None):
     return estimate_polish(made.scene, made.scene.camera, views or made.views, made.captured, TABLE)
 
 
-@pytest.mark.parametrize(("seed", "roughness", "reflectance"), [(1, 0.08, 0.05), (6, 0.15, 0.04)])
-def test_a_polished_table_is_told_with_its_numbers(seed, roughness, reflectance):
-    made = film(seed, roughness, reflectance)
+def test_a_polished_table_is_told_with_its_numbers():
+    made = film(*POLISHED)
     found = estimate(made)
     assert found is not None, made.about
     assert found.reflectance is not None
+    _, roughness, reflectance = POLISHED
     assert found.roughness[1] <= roughness <= found.roughness[2]
     assert found.reflectance[1] <= reflectance <= found.reflectance[2]
 
 
-@pytest.mark.parametrize(("seed", "spoiled"), [(4, "as it is"), (8, "exposure that drifts")])
-def test_a_matt_table_is_not_taken_for_polished(seed, spoiled):
-    made = film(seed, 0.0, 0.0, clutter=True, spoil=SPOILED[spoiled])
+def test_a_matt_table_is_not_taken_for_polished():
+    """Under an exposure that drifts."""
+    made = film(8, 0.0, 0.0, clutter=True, spoil=lambda linear, number: linear * 0.8 ** (number % 3))
     assert estimate(made) is None, made.about
 
 
 def test_views_from_one_side_tell_nothing():
-    made = film(1, 0.08, 0.05)
+    made = film(*POLISHED)
     assert estimate(made, made.views[:2]) is None
 
 
 def test_what_the_scene_says_is_not_asked():
-    made = film(1, 0.08, 0.05)
+    made = film(*POLISHED)
     (plane,) = made.scene.proxies
     polished = dataclasses.replace(plane, material=ProxyMaterial())
     assert estimate(dataclasses.replace(made, scene=dataclasses.replace(made.scene, proxies=(polished,)))) is None
@@ -59,8 +57,8 @@ def test_what_the_scene_says_is_not_asked():
 def folders(tmp_path_factory):
     """Scenes with films as pictures in folders, of a polished table and of a matt one."""
     found = {}
-    for name, reflectance in (("polished", 0.04), ("matt", 0.0)):
-        made, folder = film(6, 0.15, reflectance), tmp_path_factory.mktemp(name)
+    for name, told in (("polished", POLISHED), ("matt", (6, 0.15, 0.0))):
+        made, folder = film(*told), tmp_path_factory.mktemp(name)
         (folder / "frames").mkdir()
         for number, (image, _) in enumerate(made.views):
             cv2.imwrite(str(folder / "frames" / f"{number}.png"), image[..., ::-1])
