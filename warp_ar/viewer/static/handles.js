@@ -2,12 +2,18 @@
 
 import { deskAxes, onPlane, project } from "./geometry.js";
 
-const SVG = "http://www.w3.org/2000/svg";
-const make = (name, attributes = {}, parent = null) => {
-  const element = document.createElementNS(SVG, name);
+/** An element of SVG. */
+export const make = (name, attributes = {}, parent = null) => {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
   parent?.append(element);
   return element;
+};
+/** Where an event is in the picture that an SVG covers, pixels: centres lie at integers. */
+export const pointer = (svg, event) => {
+  const box = svg.getBoundingClientRect();
+  const { width, height } = svg.viewBox.baseVal;
+  return [((event.clientX - box.left) / box.width) * width - 0.5, ((event.clientY - box.top) / box.height) * height - 0.5];
 };
 const css = (color) => {
   const top = Math.max(...color, 1e-6);
@@ -237,19 +243,12 @@ export class Handles extends EventTarget {
     this.dispatchEvent(new CustomEvent("select", { detail: key }));
   }
 
-  #pointer(event) {
-    const box = this.#svg.getBoundingClientRect();
-    const { width, height } = this.#camera;
-    // A pixel's centre is an integer: its left edge is half a pixel to the left.
-    return [((event.clientX - box.left) / box.width) * width - 0.5, ((event.clientY - box.top) / box.height) * height - 0.5];
-  }
-
   /** An object is taken by the pixels that show it, which the program knows; handles by what is left. */
   #press(event) {
     if (event.button !== 0 || !this.#pose || this.#svg.classList.contains("pointing")) return;
     event.preventDefault();
     this.#svg.setPointerCapture(event.pointerId);
-    const [u, v] = this.#pointer(event);
+    const [u, v] = pointer(this.#svg, event);
     this.#fingers.set(event.pointerId, [u, v]);
     if (this.#pressed) return;
     const grip = this.#grips.get(event.target);
@@ -287,7 +286,7 @@ export class Handles extends EventTarget {
     item.group.focus({ preventScroll: true });
     this.#select(item.key);
     // The hand may have gone on, or up, before the answer was there.
-    if (this.#pointer(moved).some((value, i) => Math.abs(value - [u, v][i]) > 0.5)) this.#move(moved);
+    if (pointer(this.#svg, moved).some((value, i) => Math.abs(value - [u, v][i]) > 0.5)) this.#move(moved);
     if (up) this.#release();
   }
 
@@ -311,7 +310,7 @@ export class Handles extends EventTarget {
     if (!this.#drag || !this.#pose) return;
     const { item, grip, point, off, from, height, away, scale } = this.#drag;
     const part = this.#part(item);
-    const [u, v] = this.#pointer(event);
+    const [u, v] = pointer(this.#svg, event);
     if (this.#fingers.has(event.pointerId)) this.#fingers.set(event.pointerId, [u, v]);
     if (this.#fingers.size > 1 && item.part === "object") return this.#pinch(this.#drag, part);
     if (grip === "scale") return this.#put(item, "scale", Math.max((scale * this.#away(part, u, v)) / away, 1e-4));
@@ -345,7 +344,7 @@ export class Handles extends EventTarget {
     if (!this.#pose) return;
     event.preventDefault();
     const step = clamp(event.deltaY * (event.deltaMode === 1 ? 30 : 1), -240, 240);
-    const [u, v] = this.#pointer(event);
+    const [u, v] = pointer(this.#svg, event);
     if (this.#wheeled && Math.hypot(this.#wheeled.u - u, this.#wheeled.v - v) < 1) {
       this.#wheeled.step += step;
       return this.#turnWheel();

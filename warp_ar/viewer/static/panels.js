@@ -1,6 +1,6 @@
 // The panels: objects and lights, effects, exposure, quality, time.
 
-import { lightColor } from "./handles.js";
+import { lightColor, make } from "./handles.js";
 
 export const el = (name, attributes = {}, ...children) => {
   const element = document.createElement(name);
@@ -426,13 +426,7 @@ const AIM = 0.9; // the share of a budget that the program plans for
 const share = (ms) => Math.min(Math.max(Math.log(Math.max(ms, BUDGET.low) / BUDGET.low) / Math.log(BUDGET.high / BUDGET.low), 0), 1);
 const duration = (seconds) => (seconds < 90 ? `${Math.max(Math.round(seconds / 5) * 5, 5)} s` : `${Math.round(seconds / 60)} minutes`);
 const brief = (ms) => ms.toFixed(ms < 10 ? 1 : 0);
-const SVG = "http://www.w3.org/2000/svg";
-const shape = (name, attributes, text = "") => {
-  const element = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-  element.textContent = text;
-  return element;
-};
+const shape = (name, attributes, text = "") => Object.assign(make(name, attributes), { textContent: text });
 
 export class QualityPanel {
   #connection;

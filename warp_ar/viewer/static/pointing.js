@@ -1,6 +1,7 @@
 // Pointing out a part of the desk: four points of the held picture, by hand or with the arrow keys.
 
-const SVG = "http://www.w3.org/2000/svg";
+import { make, pointer } from "./handles.js";
+
 const WORDS = {
   plane: ["a corner of it", "the next corner, around it", "the third corner", "the last corner"],
   wall: ["where its left end meets the desk", "where its right end meets the desk", "its top right corner", "its top left corner"],
@@ -23,7 +24,7 @@ export class Pointing {
     this.#connection = connection;
     this.#note = note;
     svg.addEventListener("pointerdown", (event) => this.on && this.#press(event), true);
-    svg.addEventListener("pointermove", (event) => this.on && this.#aim(this.#pointer(event)), true);
+    svg.addEventListener("pointermove", (event) => this.on && this.#aim(pointer(this.#svg, event)), true);
     svg.addEventListener("keydown", (event) => this.on && this.#key(event), true);
   }
 
@@ -39,7 +40,7 @@ export class Pointing {
     this.#points = [];
     const { width, height } = this.#svg.viewBox.baseVal;
     this.#at = [width / 2, height / 2];
-    this.#group = this.#make("g", {}, this.#svg);
+    this.#group = make("g", { transform: "translate(0.5 0.5)" }, this.#svg);
     this.#svg.classList.add("pointing");
     this.#svg.setAttribute("tabindex", "0");
     this.#svg.style.visibility = "";
@@ -58,24 +59,11 @@ export class Pointing {
     if (goOn && this.#played) this.#connection.send("play", { on: true });
   }
 
-  #make(name, attributes, parent) {
-    const element = document.createElementNS(SVG, name);
-    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-    parent.append(element);
-    return element;
-  }
-
-  #pointer(event) {
-    const box = this.#svg.getBoundingClientRect();
-    const { width, height } = this.#svg.viewBox.baseVal;
-    return [((event.clientX - box.left) / box.width) * width, ((event.clientY - box.top) / box.height) * height];
-  }
-
   #press(event) {
     if (event.button !== 0) return;
     event.preventDefault();
     event.stopPropagation();
-    this.#take(this.#pointer(event));
+    this.#take(pointer(this.#svg, event));
   }
 
   #aim(at) {
@@ -98,8 +86,7 @@ export class Pointing {
   #take(at) {
     this.#points.push(at);
     if (this.#points.length < 4) return this.#draw();
-    // A pixel's centre is an integer: its left edge is half a pixel to the left.
-    this.#connection.send("outline", { kind: this.#kind, points: this.#points.map(([x, y]) => [x - 0.5, y - 0.5]) });
+    this.#connection.send("outline", { kind: this.#kind, points: this.#points });
     this.stop();
   }
 
@@ -107,9 +94,9 @@ export class Pointing {
     const unit = this.#svg.viewBox.baseVal.width / (this.#svg.clientWidth || 640);
     const [x, y] = this.#at;
     this.#group.replaceChildren();
-    if (this.#points.length) this.#make("path", { class: "pointed", d: `M${[...this.#points, this.#at].map((p) => p.join(" ")).join("L")}` }, this.#group);
-    for (const [cx, cy] of this.#points) this.#make("circle", { class: "pointed dot", cx, cy, r: 4 * unit }, this.#group);
-    this.#make("path", { class: "cross", d: `M${x - 12 * unit} ${y}h${24 * unit}M${x} ${y - 12 * unit}v${24 * unit}` }, this.#group);
+    if (this.#points.length) make("path", { class: "pointed", d: `M${[...this.#points, this.#at].map((p) => p.join(" ")).join("L")}` }, this.#group);
+    for (const [cx, cy] of this.#points) make("circle", { class: "pointed dot", cx, cy, r: 4 * unit }, this.#group);
+    make("path", { class: "cross", d: `M${x - 12 * unit} ${y}h${24 * unit}M${x} ${y - 12 * unit}v${24 * unit}` }, this.#group);
     const words = `${NAMES[this.#kind]}, point ${this.#points.length + 1} of 4: ${WORDS[this.#kind][this.#points.length]}. Click, or arrows and Enter; Escape leaves it.`;
     if (this.#note.textContent !== words) this.#note.textContent = words;
     this.#note.hidden = false;
