@@ -455,22 +455,21 @@ class _Reader:
                 self._source.note("points and lines")
                 continue
             # Thousands of nodes may share the same triangles.
-            alike = "weights" not in node
             key = (number, id(primitive))
-            if not alike or key not in self._primitives:
-                self._primitives[key] = self._primitive(primitive, self._meshes[number], node)
-            part = self._primitives[key] if alike else self._primitives.pop(key)
-            if part is None:
+            if key not in self._primitives:
+                self._primitives[key] = self._primitive(primitive)
+            if (part := self._primitives[key]) is None:
                 continue
             self._elements += len(part.faces)
             self._source.check_count(self._elements)
             bones, moves = self._bones(node, primitive) if "skin" in node else (None, False)
-            morph = None if weights is None else self._morph(primitive, part, weights)
+            shown = weights or self._still_weights(node)
+            morph = None if shown is None else self._morph(primitive, part, shown)
             bend = functools.partial(_bend, part, morph, bones, transform)
             if (placed := bend(0.0)) is not None:
-                yield placed, bend if moves or morph is not None else None
+                yield placed, bend if moves or (weights and morph) else None
 
-    def _primitive(self, primitive: dict[str, Any], mesh: dict[str, Any], node: dict[str, Any]) -> MeshPart | None:
+    def _primitive(self, primitive: dict[str, Any]) -> MeshPart | None:
         attributes = self._file.table(primitive, "attributes", "a primitive")
         if "POSITION" not in attributes:
             self._source.note("primitives without positions")
@@ -486,7 +485,6 @@ class _Reader:
                 self._file.fail(f"{name} has {len(values)} elements, POSITION {count}")
             return np.asarray(values, dtype=np.float64)
 
-        vertices, normals = self._morphed(primitive, mesh, node, vertices, attribute("NORMAL", 3))
         colors = attribute("COLOR_0", 3, 4)
         if colors is not None and colors.shape[1] == 3:
             colors = np.concatenate([colors, np.ones((count, 1))], axis=1)
@@ -504,7 +502,7 @@ class _Reader:
             f"{self._source.path}",
             vertices,
             faces,
-            normals,
+            attribute("NORMAL", 3),
             uvs=(_upward(attribute("TEXCOORD_0", 2)), _upward(attribute("TEXCOORD_1", 2))),
             colors=None if colors is None else np.clip(colors, 0.0, 1.0),
             tangents=attribute("TANGENT", 4),
@@ -531,25 +529,14 @@ class _Reader:
             return strip_triangles(indices)
         return np.stack([np.full(len(indices) - 2, indices[0]), indices[1:-1], indices[2:]], axis=-1)
 
-    def _morphed(
-        self,
-        primitive: dict[str, Any],
-        mesh: dict[str, Any],
-        node: dict[str, Any],
-        vertices: Array,
-        normals: Array | None,
-    ) -> tuple[Array, Array | None]:
-        """Return vertices and normals displaced by morph targets with the file's initial weights."""
-        targets = self._file.objects("targets", primitive)
-        weights = node.get("weights", mesh.get("weights"))
-        if not targets or not isinstance(weights, list):
-            return vertices, normals
-        for weight, target in zip(weights, targets, strict=False):
-            weight = self._file.number({"weight": weight}, "weight", 0.0, LARGEST, "a morph target", low=-LARGEST)
-            if weight:
-                vertices = vertices + weight * self._delta(target, "POSITION", len(vertices))
-                normals = None if normals is None else normals + weight * self._delta(target, "NORMAL", len(vertices))
-        return vertices, normals
+    def _still_weights(self, node: dict[str, Any]) -> Sampler | None:
+        """Return the weights of a node's morph targets without animation; None if they displace nothing."""
+        weights = node.get("weights", self._meshes[node["mesh"]].get("weights"))
+        if not isinstance(weights, list):
+            return None
+        label = "a morph target"
+        found = [self._file.number({"weight": one}, "weight", 0.0, LARGEST, label, low=-LARGEST) for one in weights]
+        return Sampler(np.zeros(1), np.array([found]), "STEP") if any(found) else None
 
     def _delta(self, target: dict[str, Any], name: str, count: int) -> Array:
         """Return the displacement of an attribute by a morph target, (count, 3); zeros if the target has none."""
