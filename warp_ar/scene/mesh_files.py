@@ -21,7 +21,7 @@ from warp_ar.scene.gltf_file import GltfFile
 from warp_ar.scene.materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart, filled, join_parts
 from warp_ar.scene.mesh_source import MeshSource
-from warp_ar.scene.node_animation import Anchor, MovingMesh, MovingPart, part_transforms
+from warp_ar.scene.node_animation import MovingMesh, MovingPart, part_transforms
 from warp_ar.scene.polygon_files import READERS
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
@@ -185,16 +185,15 @@ def moving_mesh(source: MeshSource, contents: GltfContents) -> MovingMesh:
             f"{source.path}: its animation moves {len(groups):,} parts; at most {MOST_PARTS} are: join meshes, or "
             "leave out the object's play"
         )
-    anchors, renamed = _used(contents.anchors, [on for on, _, _ in placed])
-    transforms = part_transforms(anchors, [renamed.get(on, -1) for on, _, _ in placed], 0.0)
+    transforms = part_transforms(contents.anchors, [on for on, _, _ in placed], 0.0)
     rest = join_parts(source, [_at_rest(part, way) for (_, part, _), way in zip(placed, transforms, strict=True)])
     parts = []
     for group in groups:
         mesh = _with_materials_of(rest, join_parts(source, [part for _, part, _ in group]))
         own = [bend for _, _, bend in group if bend is not None]
         bend = functools.partial(_bent, mesh, own) if own else None
-        parts.append(MovingPart(mesh, renamed.get(group[0][0], -1), bend))
-    return MovingMesh(rest, tuple(parts), anchors, contents.duration)
+        parts.append(MovingPart(mesh, group[0][0], bend))
+    return MovingMesh(rest, tuple(parts), contents.anchors, contents.duration)
 
 
 def _with_materials_of(whole: Mesh, mesh: Mesh) -> Mesh:
@@ -218,19 +217,6 @@ def _bent(mesh: Mesh, bends: list[Bending], seconds: float) -> Mesh:
     tangents = filled(parts, [part.tangents for part in parts], (1.0, 0.0, 0.0, 1.0))
     own = None if tangents is None else tangents.astype(np.float32)
     return dataclasses.replace(mesh, vertices=vertices, normals=normals, tangents=own)
-
-
-def _used(anchors: tuple[Anchor, ...], carriers: list[int]) -> tuple[tuple[Anchor, ...], dict[int, int]]:
-    """Return the anchors that have triangles and their ancestors, and their new indices by the old ones."""
-    needed: set[int] = set()
-    for carrier in carriers:
-        number = carrier
-        while number >= 0 and number not in needed:
-            needed.add(number)
-            number = anchors[number].parent
-    renamed = {old: new for new, old in enumerate(sorted(needed))}
-    kept = (dataclasses.replace(anchors[old], parent=renamed.get(anchors[old].parent, -1)) for old in renamed)
-    return tuple(kept), renamed
 
 
 def _at_rest(part: MeshPart, transform: npt.NDArray[np.float64]) -> MeshPart:

@@ -19,6 +19,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
@@ -158,8 +159,12 @@ class MovingMesh:
 
 def part_transforms(anchors: tuple[Anchor, ...], wanted: list[int], seconds: float) -> Array:
     """Return ``file_from_anchor`` of the wanted anchors, (n, 4, 4)."""
-    found: list[Array] = []
-    for anchor in anchors:
-        own = anchor.offset @ anchor.track.transform_at(seconds)
-        found.append(own if anchor.parent < 0 else found[anchor.parent] @ own)
-    return np.stack([np.eye(4) if number < 0 else found[number] for number in wanted])
+
+    @functools.cache
+    def placed(number: int) -> Array:
+        if number < 0:
+            return np.eye(4)
+        anchor = anchors[number]
+        return np.asarray(placed(anchor.parent) @ (anchor.offset @ anchor.track.transform_at(seconds)))
+
+    return np.stack([placed(number) for number in wanted])
