@@ -31,6 +31,7 @@ from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, to_axes
 from warp_ar.output.environment_axes import CUBES, check_axes, encode_harmonics, to_cube
 from warp_ar.output.places import check_replaceable
+from warp_ar.output.sink import make_folder
 from warp_ar.signals import AP1, REC_709, Chromaticities, converted
 from warp_ar.signature import PROGRAM
 
@@ -161,10 +162,7 @@ def write_environment(
                 header["envmap"] = OpenEXR.ENVMAP_LATLONG
             image = OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)})
             data = functools.partial(write_exr, image=image)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+    make_folder(path.parent)
     store(path, data)
 
 
