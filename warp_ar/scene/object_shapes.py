@@ -77,27 +77,19 @@ def part_placements(item: Object, moving: MovingMesh, seconds: float) -> Array:
     return placed
 
 
-@dataclasses.dataclass(frozen=True)
-class Stretch:
-    """Linear map, (3, 3), factored as ``scale * rotation`` for a record of ``structs.Shape``."""
-
-    scale: float
-    """Length of the longest image of a unit vector; 0 if the map is degenerate."""
-    rotation: Array
-    """The linear map divided by ``scale``; not a rotation if ``stretch`` is above 0."""
-    inverse: Array
-    """Inverse of ``rotation``."""
-    stretch: float
-    """Ratio of the longest to the shortest image of a unit vector; 0 for a rotation, whose inverse is its transpose."""
-
-
 _RIGID = 1e-6
 """Largest relative difference of lengths that counts as single-precision rounding."""
 
 
-def split_linear(linear: Array) -> Stretch:
-    """Factor a linear map, (3, 3); rotations with uniform scale are recognized."""
-    nothing = Stretch(0.0, np.eye(3), np.eye(3), 0.0)
+def split_linear(linear: Array) -> tuple[float, Array, Array, float]:
+    """Factor a linear map, (3, 3), for a record of ``structs.Shape``.
+
+    Returns:
+        Length of the longest image of a unit vector, 0 if the map is degenerate; the map divided by that length; the
+        inverse of this matrix; and the ratio of the longest to the shortest image of a unit vector, 0 for a rotation
+        with uniform scale.
+    """
+    nothing = 0.0, np.eye(3), np.eye(3), 0.0
     if not (np.abs(linear) < LARGEST).all():
         return nothing
     lengths = np.linalg.svd(linear, compute_uv=False)
@@ -106,9 +98,9 @@ def split_linear(linear: Array) -> Stretch:
         return nothing
     if shortest > (1.0 - _RIGID) * longest and np.linalg.det(linear) > 0.0:
         scale = float(np.cbrt(np.linalg.det(linear)))
-        return Stretch(scale, linear / scale, linear.T / scale, 0.0)
+        return scale, linear / scale, linear.T / scale, 0.0
     rotation: Array = linear / longest
-    return Stretch(longest, rotation, np.asarray(np.linalg.inv(rotation), dtype=np.float64), longest / shortest)
+    return longest, rotation, np.asarray(np.linalg.inv(rotation), dtype=np.float64), longest / shortest
 
 
 def shape_label(shape: ObjectShape) -> str:

@@ -463,13 +463,13 @@ def _place_part(
                 linear = np.zeros((3, 3))
             else:
                 linear, position = place.rotation @ linear, place.apply(position)
-    way = split_linear(linear)
-    if way.scale == 0.0 or not (np.abs(position) < LARGEST).all():
+    scale, rotation, inverse, stretch = split_linear(linear)
+    if scale == 0.0 or not (np.abs(position) < LARGEST).all():
         record["position"], record["scale"], record["stretch"] = _AWAY, _AWAY_SCALE, 0.0
         record["rotation"] = np.eye(3)
         return
-    record["scale"], record["rotation"], record["position"] = way.scale, way.rotation, position
-    record["stretch"], record["inverse"] = way.stretch, way.inverse
+    record["scale"], record["rotation"], record["position"] = scale, rotation, position
+    record["stretch"], record["inverse"] = stretch, inverse
 
 
 def _factor(color: scenes.Color) -> tuple[tuple[float, float, float], Path | None]:
