@@ -173,9 +173,17 @@ def axe_core() -> str:
     return (Path(package.__file__).parent / "axe.min.js").read_text()
 
 
-def findings(page: Any) -> list[Any]:
-    """What axe-core, which the page must have, finds in it that hinders somebody, minor findings left out."""
-    found = page.evaluate(f"axe.run({{runOnly: {list(WORKS)}}})")["violations"]
+def findings(page: Any, *, contrast: bool = True, names: bool = True) -> list[Any]:
+    """What axe-core, which the page must have, finds in it that hinders somebody, minor findings left out.
+
+    Args:
+        page: Looked at.
+        contrast: Whether colours are looked at, which depend on the scheme and take most of the time.
+        names: Whether all else is looked at, which depends on what is shown.
+    """
+    only = list(WORKS) if names else ["color-contrast"]
+    rules = {"color-contrast": {"enabled": contrast}}
+    found = page.evaluate("options => axe.run(options)", {"runOnly": only, "rules": rules})["violations"]
     return [
         (one["id"], [node["html"] for node in one["nodes"]], one["help"]) for one in found if one["impact"] != "minor"
     ]
