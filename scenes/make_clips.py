@@ -49,7 +49,7 @@ GUIDE_SPP = 32
 
 
 def ease(t: float, start: float, stop: float) -> float:
-    """0 before ``start``, 1 after ``stop``, smooth between."""
+    """Return 0 before ``start``, 1 after ``stop``, and a smooth rise between, at time ``t``."""
     s = float(np.clip((t - start) / (stop - start), 0, 1))
     return s * s * (3 - 2 * s)
 
@@ -57,7 +57,11 @@ def ease(t: float, start: float, stop: float) -> float:
 def orbit(
     azimuth: float, distance: float, height: float, target: tuple[float, float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Eye and target of a camera at ``distance`` (in the plane) and ``height``; azimuth 0 looks along +y."""
+    """Return the position of a camera and the point that it looks at, metres.
+
+    The camera has the horizontal ``distance`` from ``target`` and the height ``height``. At azimuth 0 degrees it looks
+    along +y.
+    """
     a = np.radians(azimuth)
     return np.array([target[0] + distance * np.sin(a), target[1] - distance * np.cos(a), height]), np.array(target)
 
@@ -87,13 +91,13 @@ class Clip:
     frames: int
     """Number of frames at 24 per second."""
     camera: Callable[[float], tuple[np.ndarray, np.ndarray]]
-    """Eye and target at time 0 to 1, world metres."""
+    """Function from time, 0 to 1, to the camera's position and the point that it looks at, world metres."""
     levels: Callable[[float], dict[str, float]]
-    """Factor on each lamp's radiance at time 0 to 1."""
+    """Function from time, 0 to 1, to the factor on each lamp's radiance."""
 
 
 def desk_levels(t: float) -> dict[str, float]:
-    """A cloud passes, dusk falls for a moment, the ceiling lamp comes up, daylight returns."""
+    """Return factors on lamps' radiance: a cloud passes, dusk falls, the ceiling lamp comes up, daylight returns."""
     cloud = 1 - 0.25 * np.sin(np.pi * ease(t, 0.08, 0.3)) ** 2
     return {
         "window": cloud * (1 - 0.8 * ease(t, 0.36, 0.5) + 0.8 * ease(t, 0.82, 0.97)),
@@ -127,7 +131,7 @@ BUNDLED = {
     "wire_opposing": 36,
     "darken": 36,
 }
-"""Frame of each scene whose truth is bundled; the light of the last three is still, that of ``product`` changes."""
+"""Number of the frame of each scene whose truth is bundled. The light of the last three scenes does not change."""
 
 
 class Renderer:
@@ -166,7 +170,7 @@ class Renderer:
         self.lamps.update()
 
     def frame(self, t: float, seed: int) -> np.ndarray:
-        """Linear camera values ``(HEIGHT, WIDTH, 3)`` at time ``t``."""
+        """Return the picture at time ``t`` in linear camera values, ``(HEIGHT, WIDTH, 3)``."""
         self.light(t)
         eye, target = CLIPS[self.clip].camera(t)
         sensor = mi.load_dict(
@@ -197,7 +201,7 @@ class Renderer:
         return pyoidn.denoise(color, albedo=albedo, normal=np.ascontiguousarray(normal), hdr=True)
 
     def environment(self, t: float, height: int = 256, rounds: int = 64) -> np.ndarray:
-        """Light arriving at the ball's centre, latlong ``(height, 2 height, 3)``; render it without the ball."""
+        """Return the light that arrives at the ball's place, latlong ``(height, 2 height, 3)``; without the ball."""
         import drjit as dr
 
         self.light(t)
@@ -220,13 +224,13 @@ class Renderer:
 
 
 def encode(linear: np.ndarray) -> np.ndarray:
-    """Clip at 1, sRGB-encode, round to 8 bit."""
+    """Return 8-bit codes of linear values: clipped at 1, sRGB-encoded, rounded."""
     x = np.clip(linear, 0, 1)
     return np.round(np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055) * 255).astype(np.uint8)
 
 
 def pose(clip: str, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """R and t that map marker-frame points X to camera points R X + t (OpenCV: x right, y down, z ahead)."""
+    """Return R and t that map marker-frame points X to camera points R X + t (OpenCV: x right, y down, z ahead)."""
     eye, target = CLIPS[clip].camera(t)
     ahead = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(ahead, [0, 0, 1])
@@ -236,7 +240,7 @@ def pose(clip: str, t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_video(path: pathlib.Path, images: Iterator[np.ndarray], crf: int) -> None:
-    """H.264, 4:2:0, BT.709, every second a key frame."""
+    """Write pictures as H.264 video, 4:2:0, BT.709, with a key frame every second; ``crf`` is the encoder's quality."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=FPS)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
@@ -247,7 +251,7 @@ def write_video(path: pathlib.Path, images: Iterator[np.ndarray], crf: int) -> N
 
 
 def times(clip: str, frames: int | None) -> list[float]:
-    """Times 0 to 1 of a clip's frames, all of them or ``frames`` spread evenly."""
+    """Return times, 0 to 1, of a clip's frames: of all, or of ``frames`` that are spread evenly."""
     count = frames or CLIPS[clip].frames
     return [k / max(1, count - 1) for k in range(count)]
 
@@ -267,7 +271,7 @@ def make_clip(clip: str, options: argparse.Namespace) -> None:
 
 
 def make_truth(name: str, options: argparse.Namespace) -> None:
-    """Frames first, middle and last of a scene with its virtual objects really there, under ``TRUTH/NAME``."""
+    """Render a scene's first, middle and last frame with its virtual objects as real ones, under ``TRUTH/NAME``."""
     clip = SCENES[name]
     scene = tomllib.loads((HERE / f"{name}.toml").read_text())
     moments = times(clip, options.frames)
@@ -308,7 +312,7 @@ def make_truth(name: str, options: argparse.Namespace) -> None:
 
 
 def bundle_truth(name: str, options: argparse.Namespace) -> None:
-    """One frame of a scene as it should look, opaque where that differs from the camera's frame."""
+    """Write the truth of one frame of a scene as a picture that is opaque where it differs from the camera's frame."""
     clip, index = SCENES[name], BUNDLED[name]
     scene = tomllib.loads((HERE / f"{name}.toml").read_text())
     moment, scale = times(clip, None)[index], scene.get("exposure", {}).get("scale", 1.0)

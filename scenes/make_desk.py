@@ -1,4 +1,4 @@
-"""What the cameras of the bundled clips see: a furnished environment, the desk, and clutter on it."""
+"""Geometry, materials and lamps of the bundled clips: a furnished room, the desk, and clutter on it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from make_shapes import (
 from make_textures import CARD, PAPER, card, page, tin, view, wood
 
 TABLE = -0.0004
-"""Height of the table's top: the marker is printed on a card 0.4 mm thick, and its face is z = 0."""
+"""Height of the table top, metres: the marker is printed on a card of 0.4 mm, whose upper face is z = 0."""
 BALL, BALL_RADIUS, BALL_REFLECTANCE = (-0.12, 0.03, 0.0346), 0.035, (0.85, 0.85, 0.87)
 PROXY = {"at": (0.0, 0.21, 0.0446), "size": (0.2, 0.075, 0.09), "turn": 9.0}
 """The tea tin behind the marker, which the scene files model as a box."""
@@ -34,7 +34,7 @@ ENVIRONMENT = {"x": (-1.7, 2.3), "y": (-2.6, 0.85), "z": (-0.74, 1.75)}
 
 
 def window(name: str, center: Any, right: Any, up: Any, radiance: np.ndarray) -> Dict:
-    """A glowing view with a white frame and a cross of bars, standing a little inside the wall."""
+    """Return a window: an emitting view with a white frame and a cross of bars, a little inside the wall."""
     right, up = np.array(right, float), np.array(up, float)
     inward = np.cross(right, up) / np.linalg.norm(np.cross(right, up))
     center = np.array(center, float)
@@ -57,7 +57,7 @@ def window(name: str, center: Any, right: Any, up: Any, radiance: np.ndarray) ->
 
 
 def walls_and_furniture() -> Dict:
-    """The room itself, without its bookcase."""
+    """Return the walls and the furniture of the room, without its bookcase."""
     (x0, x1), (y0, y1), (z0, z1) = ENVIRONMENT["x"], ENVIRONMENT["y"], ENVIRONMENT["z"]
     cx, cy, cz, hx, hy, hz = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2, (x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2
     plaster = matte((0.72, 0.68, 0.6))
@@ -107,12 +107,12 @@ def bookcase() -> Dict:
 
 
 def emitting(radiance: Any) -> Dict:
-    """Surface of a lamp."""
+    """Return the material of a lamp that emits ``radiance``."""
     return {"bsdf": matte(0.7), "emitter": {"type": "area", "radiance": rgb(radiance)}}
 
 
 def lamps_of(clip: str) -> Dict:
-    """Every lamp of a clip at level 1; their names are keys of the clip's levels."""
+    """Return every lamp of a clip at level 1, by the names that the clip's levels use."""
     x0, (y1, z1) = ENVIRONMENT["x"][0], (ENVIRONMENT["y"][1], ENVIRONMENT["z"][1])
     shapes: Dict = {}
     if clip == "desk":
@@ -267,7 +267,7 @@ def cable(folder: pathlib.Path, name: str, points: list[tuple[float, float]], ra
 
 
 def wires(folder: pathlib.Path) -> Dict:
-    """Two cables that no model knows."""
+    """Return two cables, which no scene file models."""
     wire = [
         (-0.3, -0.2),
         (-0.16, -0.1),
@@ -337,7 +337,7 @@ def desk_clutter(folder: pathlib.Path) -> Dict:
 
 
 def clutter(clip: str, folder: pathlib.Path) -> Dict:
-    """What stands and lies on the desk. Only the tea tin of ``desk`` is known to the scene files."""
+    """Return the objects on the desk. Scene files model none of them but the tea tin of ``desk``."""
     if clip == "wire":
         return wires(folder)
     shapes = (

@@ -21,18 +21,18 @@ from trimesh.visual.material import PBRMaterial
 HERE = pathlib.Path(__file__).resolve().parent
 SIDES = 64
 WIDTH, HEIGHT, FINE = 512, 256, 2
-"""Of the label's pictures; drawn ``FINE`` times as large and averaged."""
+"""Width and height of the label's pictures, pixels. They are drawn ``FINE`` times as large and averaged."""
 GLAZE, PAPER, INK, GOLD = (30, 61, 52), (226, 214, 188), (96, 40, 30), (255, 206, 120)
-"""sRGB codes."""
+"""Colours of the jar and its label, sRGB codes."""
 RIBS = 48
 
 BODY = [(0.0, 0.0), (0.0265, 0.0), (0.028, 0.0015), (0.028, 0.066), (0.0262, 0.0705), (0.022, 0.0725)]
-"""Radius and height of the body's outline, metres; the lid's likewise."""
+"""(radius, height) of points on the outline of the jar's body, metres; ``LID`` holds those of the lid."""
 LID = [(0.022, 0.0725), (0.0245, 0.0725), (0.0245, 0.0875), (0.0235, 0.0885), (0.0, 0.0885)]
 
 
 def turn_outline(outline: list[tuple[float, float]]) -> tuple[np.ndarray, ...]:
-    """Positions, normals, texture coordinates (v up) and triangles of an outline that is turned about z.
+    """Return positions, normals, texture coordinates (v up) and triangles of an outline that is turned about z.
 
     Every straight piece has normals of its own: edges are sharp.
     """
@@ -57,7 +57,7 @@ def turn_outline(outline: list[tuple[float, float]]) -> tuple[np.ndarray, ...]:
 
 
 def draw_label() -> tuple[np.ndarray, np.ndarray]:
-    """The label, (256, 512, 3) sRGB codes, and where it is gold, (256, 512) from 0 to 1."""
+    """Return the label, (256, 512, 3) sRGB codes, and the share of gold in each pixel, (256, 512), 0 to 1."""
     height, width = HEIGHT * FINE, WIDTH * FINE
     colors = np.full((height, width, 3), GLAZE, np.uint8)
     gold = np.zeros((height, width), np.uint8)
@@ -87,7 +87,7 @@ def draw_label() -> tuple[np.ndarray, np.ndarray]:
 
 
 def normals_of(heights: np.ndarray, steepness: float) -> np.ndarray:
-    """Codes of a normal map (y up, as glTF has it) of heights whose columns join."""
+    """Return codes of glTF's normal map (y up) of a map of heights, whose last column joins its first."""
     dx = 0.5 * (np.roll(heights, -1, 1) - np.roll(heights, 1, 1))
     dy = np.gradient(heights, axis=0)
     normal = np.stack([-steepness * dx, steepness * dy, np.ones_like(heights)], axis=-1)
@@ -96,7 +96,7 @@ def normals_of(heights: np.ndarray, steepness: float) -> np.ndarray:
 
 
 def make_jar() -> trimesh.Scene:
-    """The jar in glTF's axes (y up, metres), its foot at the origin."""
+    """Return the jar in glTF's axes (y up, metres), its foot at the origin."""
     colors, gold = draw_label()
     surface = np.stack([np.zeros_like(gold), 0.42 - 0.2 * gold, gold], axis=-1)
     body = PBRMaterial(

@@ -1,9 +1,9 @@
-"""Draw what the screen of the scene ``screen`` shows.
+"""Draw the picture on the screen of the scene ``screen``.
 
     python scenes/make_screen.py [--out scenes/meshes/screen.png]
 
-An orange sun over a blue field: colours that the desk before the screen shows apart. Drawn four times as large and
-averaged.
+An orange sun over a blue sea: two colours of light that differ clearly on the desk before the screen. The picture is
+drawn four times as large and averaged.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ HERE = pathlib.Path(__file__).resolve().parent
 
 
 def draw_screen() -> np.ndarray:
-    """The picture, (60, 96, 3) BGR, sRGB-encoded."""
+    """Return the picture, (60, 96, 3) BGR, sRGB-encoded."""
     y, x = np.mgrid[: HEIGHT * FINE, : WIDTH * FINE] + 0.5
     x, y = x / (WIDTH * FINE), y / (WIDTH * FINE)
     sky = np.stack([255.0 - 60.0 * x, 120.0 - 80.0 * x, 20.0 + 20.0 * x], axis=-1)

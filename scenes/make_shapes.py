@@ -1,4 +1,4 @@
-"""Small geometry and materials for the bundled clips, as dictionaries of Mitsuba."""
+"""Simple shapes and materials for the bundled clips, as dictionaries of Mitsuba."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Dict = dict[str, Any]
 
 
 def turned(at: tuple[float, ...] = (0, 0, 0), turn: float = 0.0, size: Any = 1.0) -> mi.ScalarTransform4f:
-    """Scale, turn about z by degrees, move."""
+    """Return the transform that scales by ``size``, turns about z by ``turn`` degrees, and moves to ``at``."""
     t = mi.ScalarTransform4f()
     return t.translate(list(at)) @ t.rotate([0, 0, 1], turn) @ t.scale(size)
 
@@ -29,7 +29,7 @@ def ball(at: tuple[float, ...], radius: float, bsdf: Dict) -> Dict:
 
 
 def quad(center: Any, right: Any, up: Any, **rest: Any) -> Dict:
-    """Rectangle spanned by the half sides ``right`` and ``up``; it faces along their cross product."""
+    """Return a rectangle with the half sides ``right`` and ``up``; it faces along their cross product."""
     right, up = np.array(right, float), np.array(up, float)
     normal = np.cross(right, up)
     matrix = np.eye(4)
@@ -38,7 +38,7 @@ def quad(center: Any, right: Any, up: Any, **rest: Any) -> Dict:
 
 
 def grid_mesh(folder: pathlib.Path, name: str, point: np.ndarray, bsdf: Dict, to_world: Any = None) -> Dict:
-    """A mesh over a grid of points ``(rows, columns, 3)`` whose columns close on themselves, smooth-shaded."""
+    """Return a smooth-shaded mesh over a grid of points ``(rows, columns, 3)``, whose last column joins its first."""
     rows, columns = point.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     nxt = np.roll(index, -1, 1)
@@ -57,7 +57,7 @@ def grid_mesh(folder: pathlib.Path, name: str, point: np.ndarray, bsdf: Dict, to
 
 
 def lathe(profile: list[tuple[float, float]], sides: int = 48, repeat: int = 4) -> np.ndarray:
-    """Turn a profile of (radius, height) about z; each point is repeated nearby so that corners stay crisp."""
+    """Return points of a profile of (radius, height) turned about z: ``repeat`` per piece, two close to its ends."""
     points = np.array(profile, float)
     steps = [points[0]]
     for a, b in itertools.pairwise(points):
@@ -72,7 +72,7 @@ def lathe(profile: list[tuple[float, float]], sides: int = 48, repeat: int = 4) 
 
 
 def spline(points: list[tuple[float, ...]], steps: int = 24) -> np.ndarray:
-    """Catmull-Rom curve through ``points``, ``(n, 3)``."""
+    """Return points of the Catmull-Rom curve through ``points``, ``(n, 3)``."""
     p = np.array(points, float)
     p = np.concatenate([2 * p[:1] - p[1:2], p, 2 * p[-1:] - p[-2:-1]])
     t = np.linspace(0, 1, steps, endpoint=False)[:, None]
@@ -84,7 +84,7 @@ def spline(points: list[tuple[float, ...]], steps: int = 24) -> np.ndarray:
 
 
 def tube(path: np.ndarray, radius: float, sides: int = 16) -> np.ndarray:
-    """Rings of a tube along ``path`` ``(n, 3)``, its ends closed by a point."""
+    """Return the points of a tube's rings along ``path`` ``(n, 3)``; a point closes each end."""
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     side = np.cross(along, np.where(np.abs(along[:, 2:3]) > 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]))
@@ -121,13 +121,13 @@ def mirror(color: Any) -> Dict:
 
 
 def texture(image: np.ndarray, filtering: str = "bilinear") -> Dict:
-    """Linear RGB image; row 0 is the top of the quad that it is put on."""
+    """Return Mitsuba's texture of a linear RGB image; row 0 is at the top of the quad that it covers."""
     data = mi.Bitmap(np.ascontiguousarray(image[::-1], np.float32))
     return {"type": "bitmap", "bitmap": data, "raw": True, "filter_type": filtering, "wrap_mode": "clamp"}
 
 
 def noise(rng: np.random.Generator, height: int, width: int, cells: tuple[int, int], octaves: int = 4) -> np.ndarray:
-    """Sum of ever finer smooth noise, about -1 to 1; ``cells`` is the coarsest grid (rows, columns)."""
+    """Return a sum of ever finer smooth noise, about -1 to 1; ``cells`` is the coarsest grid (rows, columns)."""
     total = np.zeros((height, width), np.float32)
     for k in range(octaves):
         shape = (min(cells[0] << k, height) + 1, min(cells[1] << k, width) + 1)

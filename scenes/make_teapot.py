@@ -67,7 +67,7 @@ HALVES = {
 
 
 def patches() -> list[np.ndarray]:
-    """The 32 patches, each ``(4, 4, 3)``: the first index runs along the part, the second around it."""
+    """Return control points of the 32 patches, each ``(4, 4, 3)``: first index along the part, second around it."""
     found = []
     for name, profile in PROFILES.items():
         fit = LID_FIT if name in ("setting", "lid") else 1.0
@@ -89,7 +89,7 @@ def patches() -> list[np.ndarray]:
 
 
 def bernstein(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cubic Bernstein polynomials at ``t`` ``(n,)`` and their derivatives, each ``(n, 4)``."""
+    """Return cubic Bernstein polynomials at ``t`` ``(n,)`` and their derivatives, each ``(n, 4)``."""
     s = 1.0 - t
     value = np.stack([s**3, 3 * s * s * t, 3 * s * t * t, t**3], -1)
     slope = np.stack([-3 * s * s, 3 * s * s - 6 * s * t, 6 * s * t - 3 * t * t, 3 * t * t], -1)
@@ -97,7 +97,7 @@ def bernstein(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tessellate(patch: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points ``(n, n, 3)``, unit normals ``(n, n, 3)`` and triangles ``(m, 3)`` of one patch, n = segments + 1.
+    """Return points ``(n, n, 3)``, unit normals ``(n, n, 3)`` and triangles ``(m, 3)`` of one patch, n = segments + 1.
 
     The normal is the cross product of the two tangents. Where a patch is pinched to a point one tangent vanishes; its
     direction just beside the point is the limit, so tangents are taken a hair inside the patch.
@@ -117,7 +117,7 @@ def tessellate(patch: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray
 
 
 def outward(point: np.ndarray, name: str) -> np.ndarray:
-    """A direction that leaves the solid near ``point``: from the axis of the part that the patch belongs to."""
+    """Return a direction out of the solid near ``point``: away from the axis of the part ``name``."""
     if name.startswith(("handle", "spout")):
         middle = point.mean(axis=1, keepdims=True)  # the part is a tube: its axis lies amid each ring's half
         middle[..., 1] = 0.0
@@ -130,7 +130,7 @@ def outward(point: np.ndarray, name: str) -> np.ndarray:
 
 
 def teapot(segments: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices ``(v, 3)``, normals ``(v, 3)`` and triangles ``(t, 3)``, facing outward, no triangle of zero area."""
+    """Return vertices ``(v, 3)``, normals ``(v, 3)`` and triangles ``(t, 3)``, facing outward, none of zero area."""
     names = [name for name in PROFILES for _ in range(4)] + [name for name in HALVES for _ in range(2)]
     points, normals, triangles, count = [], [], [], 0
     for name, patch in zip(names, patches(), strict=True):

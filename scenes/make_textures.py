@@ -13,7 +13,7 @@ MARKER, CARD, PAPER, INK = 0.08, 0.12, 0.85, 0.04
 
 
 def wood(light: Any, dark: Any, seed: int, boards: int = 9, shape: tuple[int, int] = (1536, 2048)) -> np.ndarray:
-    """Boards along x: growth rings stretched by the cut, fibres, pores, and a thin dark joint between boards."""
+    """Return a picture of boards along x: growth rings, fibres, pores, and a thin dark joint between boards."""
     rng = np.random.default_rng(seed)
     rows, width = shape
     height = rows // boards
@@ -36,7 +36,7 @@ def wood(light: Any, dark: Any, seed: int, boards: int = 9, shape: tuple[int, in
 
 
 def card() -> np.ndarray:
-    """The printed card: marker 0 of DICT_4X4_50, sharp to the pixel, ink on paper."""
+    """Return a picture of the printed card: marker 0 of DICT_4X4_50, ink on paper, sharp to the pixel."""
     pixels = 48 * 6
     marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 0, pixels)
     edge = round(pixels * (CARD / MARKER - 1) / 2)
@@ -45,7 +45,7 @@ def card() -> np.ndarray:
 
 
 def tin() -> np.ndarray:
-    """Face of the tea tin: a cream band with a ring between two thin lines on sage green."""
+    """Return a picture of the tea tin's face: a cream band with a ring between two thin lines on sage green."""
     image = np.tile(np.array([0.16, 0.27, 0.22], np.float32), (360, 800, 1))
     cream, ink = (0.72, 0.66, 0.52), (0.12, 0.2, 0.17)
     cv2.rectangle(image, (0, 95), (800, 265), cream, -1)
@@ -72,7 +72,7 @@ def tin() -> np.ndarray:
 
 
 def page() -> np.ndarray:
-    """A ruled page with a few written lines."""
+    """Return a picture of a ruled page with a few written lines."""
     rng = np.random.default_rng(5)
     image = np.full((640, 448, 3), 0.74, np.float32) * np.array([1.0, 0.98, 0.92], np.float32)
     for y in range(60, 630, 28):
@@ -90,7 +90,7 @@ def page() -> np.ndarray:
 
 
 def view(seed: int) -> np.ndarray:
-    """What lies behind the window: sky that brightens toward the horizon, far trees, a lawn. Mean about 1."""
+    """Return the view from the window: sky that brightens toward the horizon, far trees, a lawn; mean about 1."""
     rng = np.random.default_rng(seed)
     rows, columns = 192, 192
     v = np.linspace(1, 0, rows, dtype=np.float32)[:, None, None]

@@ -1,4 +1,4 @@
-"""The virtual objects and lights of a scene file as Mitsuba has them, for truth."""
+"""Virtual objects and lights of a scene file in Mitsuba's terms, for path-traced truth."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ HERE = pathlib.Path(__file__).resolve().parent
 
 
 def leaving_share(exponent: float, count: int = 512) -> np.ndarray:
-    """Share of a Phong lobe above the surface, by the cosine of the mirror direction, 0 to 1 in ``count`` steps.
+    """Return the share of a Phong lobe above the surface, for ``count`` cosines of the mirror direction from 0 to 1.
 
-    The mean over the lobe's own cosine, cos = u^(1 / (n + 1)), of the share of that cone which lies above.
+    The lobe consists of cones around the mirror direction, of the cosine u^(1 / (n + 1)). The result is the mean, over
+    u, of the share of a cone that lies above the surface.
     """
     cosine = ((np.arange(4096) + 0.5) / 4096) ** (1 / (exponent + 1))
     sine = np.sqrt(1 - cosine**2)
@@ -29,10 +30,10 @@ def leaving_share(exponent: float, count: int = 512) -> np.ndarray:
 
 @functools.cache
 def register_phong() -> str:
-    """Name of a BSDF that is ``warp_ar.kernels.materials``' Phong; Mitsuba has none.
+    """Register the Phong model of ``warp_ar.kernels.materials``, which Mitsuba lacks, and return its name.
 
-    Lambert's, beside a lobe of the radiance form: what is seen is the mean of what arrives, weighted by cos^n of the
-    angle to the mirror direction, over the part of the lobe that leaves the surface.
+    It has a diffuse part and a lobe. The lobe reflects the mean of the arriving radiance over the directions above the
+    surface, weighted by cos^n of the angle to the mirror direction.
     """
     import drjit as dr
 
@@ -47,7 +48,7 @@ def register_phong() -> str:
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def lobe(self, si: Any, wo: Any) -> Any:
-            """Density of the lobe over directions that leave the surface; 0 below it."""
+            """Return the lobe's density, per steradian, for directions above the surface; 0 below it."""
             mirrored = mi.reflect(si.wi)
             place = dr.maximum(mi.Frame3f.cos_theta(mirrored), 0) * (dr.width(self.leaving) - 1)
             low = dr.minimum(mi.UInt32(place), dr.width(self.leaving) - 2)
@@ -109,7 +110,7 @@ def virtual_material(material: Dict) -> Dict:
 
 
 def placed(item: Dict) -> Any:
-    """Where an object or a light stands, and how it is turned."""
+    """Return the transform of an object or a light: its position and rotation in the scene file."""
     t = mi.ScalarTransform4f()
     rx, ry, rz = item.get("rotate", (0, 0, 0))
     return (
@@ -121,14 +122,14 @@ def placed(item: Dict) -> Any:
 
 
 def picture_of(image: Any, channel: int | None = None) -> Dict:
-    """A picture of a glTF as Mitsuba looks it up, its codes as numbers from 0 to 1: all channels, or one."""
+    """Return Mitsuba's texture of a glTF's picture, its codes as numbers from 0 to 1: all channels, or one."""
     values = np.asarray(image.convert("RGB"), np.float32) / 255.0
     values = values if channel is None else values[..., channel : channel + 1]
     return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True}
 
 
 def file_material(material: Any) -> Dict:
-    """A material of a glTF, as trimesh reads it; factors beside pictures must be 1."""
+    """Return Mitsuba's form of a glTF's material, read by trimesh; factors on pictures must be 1."""
     color = np.array(material.baseColorFactor if material.baseColorFactor is not None else (255,) * 4) / 255.0
     base: Any = color[:3]
     if material.baseColorTexture is not None:
@@ -147,9 +148,9 @@ def file_material(material: Any) -> Dict:
 
 
 def file_mesh(path: pathlib.Path, place: Any) -> list[Any]:
-    """The parts of a glTF with the materials of the file, +Y up turned to +Z.
+    """Return the parts of a glTF with the file's materials, turned from +Y up to +Z up.
 
-    trimesh reads it, not ``warp_ar``: what is wrong with our own reading shows against this truth.
+    trimesh reads the file, so that errors of ``warp_ar``'s own reader show in comparisons with this truth.
     """
     upright = place @ mi.ScalarTransform4f().rotate([1, 0, 0], 90)
     parts = []
@@ -207,7 +208,7 @@ def virtual_object(item: Dict, folder: pathlib.Path) -> Dict:
 
 
 def virtual_rect(light: Dict) -> Dict:
-    """A rectangle that shines where its +z points; its picture, if it has one, stands upright with +y."""
+    """Return a rectangle that emits toward its +z; the top of its picture, if it has one, is at +y."""
     factor = np.array(light.get("color", (1.0, 1.0, 1.0))) * light["intensity"]
     radiance: Dict = rgb(factor)
     if "image" in light:

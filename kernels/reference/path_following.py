@@ -62,7 +62,7 @@ MOST_VERTICES = wp.constant(64)
 SURE_VERTICES = wp.constant(2)
 """Number of surfaces before Russian roulette begins."""
 MOST_SURVIVAL = wp.constant(wp.float32(0.95))
-"""Largest probability to continue a path."""
+"""Largest probability with which Russian roulette continues a path."""
 PICK = wp.constant(0)
 SCATTER = wp.constant(1)
 SKY = wp.constant(2)
@@ -71,7 +71,7 @@ FIRST_LIGHT = wp.constant(4)
 """First stream of random numbers for virtual lights at a vertex; each light has its own while streams last."""
 
 CANDIDATES = wp.constant(4)
-"""Directions toward the environment's light at a first surface, of which one is followed."""
+"""Number of directions toward the environment's light drawn at a first surface, of which one is followed."""
 GOLDEN = wp.constant(wp.float32(0.61803399))
 SILVER = wp.constant(wp.float32(0.41421356))
 """Step of the random number between candidates, which spreads them evenly."""
@@ -81,7 +81,7 @@ MOST_RANDOM = wp.constant(wp.float32(0.99999994))
 SURFACE = wp.constant(0)
 RAY = wp.constant(1)
 ENDED = wp.constant(2)
-"""Next step of a path."""
+"""Next step of a path: scatter at a surface, trace a ray, or end."""
 
 
 @wp.struct
@@ -118,13 +118,13 @@ class PathPair:
 
 @wp.struct
 class DirectionSample:
-    """A direction drawn at a surface: toward light, or for the next ray."""
+    """A direction drawn at a surface, toward light or for the next ray, and the light from it."""
 
     direction: wp.vec3  # unit; zero where there is none
     density: wp.float32  # per steradian; NO_DENSITY if no other strategy can draw it
     times: wp.float32  # number of candidates of that density
     distance: wp.float32  # of the light's source
-    radiance: wp.vec3  # from there, or the irradiance of a surface that faces the light
+    radiance: wp.vec3  # of the source, or the irradiance of a surface that faces the light
     per: wp.float32  # divisor of ``radiance``: the density, or 1
 
 
@@ -184,7 +184,7 @@ def reflected_from(surface: Surface, hit: Hit, wo: wp.vec3, wi: wp.vec3) -> wp.v
 # because each alone has the right density. So they are spread evenly from one random start.
 @wp.func
 def candidate_value(surface: Surface, hit: Hit, wo: wp.vec3, sky: SkyLight, times: wp.float32) -> wp.float32:
-    """Return the light of a candidate that a surface reflects, weighted against directions drawn by the surface."""
+    """Return the brightness of a candidate's light that a surface reflects, weighted against draws by the surface."""
     value = brightness(wp.cw_mul(reflected_from(surface, hit, wo, sky.direction), sky.radiance))
     if value > 0.0:
         value *= balance(times * sky.density, surface_density(surface, hit.normal, wo, sky.direction))
@@ -391,7 +391,10 @@ class DirectLight:
 def add_direct(
     direct: DirectLight, arriving: wp.vec3, is_sky: wp.bool, hidden: wp.bool, path: PathState, with_virtual: wp.bool
 ) -> DirectLight:
-    """Add light of the environment or a virtual light that no physical surface hides; ``hidden`` by a virtual one."""
+    """Add light of the environment (``is_sky``) or of a virtual light to the sums ``direct`` of a surface.
+
+    No physical surface hides the light; ``hidden`` says whether a virtual object does.
+    """
     out = direct
     if is_sky:
         out.of_sky = arriving
@@ -406,7 +409,7 @@ def add_direct(
 
 @wp.func
 def is_first_white(pair: PathPair) -> wp.bool:
-    """Return whether a path is at a first surface that is replaced to measure arriving light."""
+    """Return whether a path is at its first surface, and a white one replaces that to measure arriving light."""
     return pair.white and pair.path.depth == 0
 
 
@@ -429,14 +432,14 @@ def with_virtual_content(pair: PathPair) -> wp.bool:
 
 @wp.func
 def is_polished(kind: wp.int32, surface: Surface) -> wp.bool:
-    """Return whether a surface has a narrow lobe, whose caustics paths from the camera rarely find."""
+    """Return whether a surface is an object's with a glossy lobe, whose caustics paths from the camera rarely find."""
     matt = surface.model == wp.static(int(LAMBERT)) or surface.model == wp.static(int(MIRROR))
     return kind == OBJECT and not matt
 
 
 @wp.func
 def lights_at(scene: LocalScene, kind: wp.int32, surface: Surface, pair: PathPair) -> wp.int32:
-    """Return the number of virtual lights that the followed path samples at its surface: all, or none."""
+    """Return the number of virtual lights that the path samples at its present surface: all of the scene's, or 0."""
     # Their light on a white surface by way of a polished one is found by paths from the lights (``path_photons``).
     followed = scene.lights_followed and pair.white and not pair.lobe and pair.path.depth > 0
     if (followed and is_polished(kind, surface)) or not with_virtual_content(pair):
@@ -568,7 +571,7 @@ def meet(scene: LocalScene, vertex: Vertex, pair: PathPair) -> PathPair:
 
 @wp.func
 def take_seen(pair: PathPair, seen: SeenProxy) -> PathPair:
-    """Add the frame's radiance of the proxy at which a path is; a path without virtual content ends there."""
+    """Add a proxy's radiance in the frame to a path that meets it; a path without virtual content ends at the proxy."""
     out = pair
     out.rays += seen.rays
     if seen.shows and not pair.path.changes_only:

@@ -219,7 +219,7 @@ class PointOfEmitter:
 
 @wp.func
 def draw_on_emitters(sky: Sky, u: wp.vec2) -> PointOfEmitter:
-    """Draw a point of a near emitter, in proportion to its light as in ``draw_sky``."""
+    """Return the start of a path at a near emitter: a point drawn with a probability proportional to its light."""
     out = PointOfEmitter()
     height = sky.radiance.shape[0]
     width = sky.radiance.shape[1]
@@ -237,7 +237,7 @@ def draw_on_emitters(sky: Sky, u: wp.vec2) -> PointOfEmitter:
 
 @wp.func
 def seen_area(params: FrameParams, vertex: Vertex, toward_light: wp.vec3) -> wp.float32:
-    """Return the radiance that a path of power 1 adds to the pixel that shows its white surface; 0 if it faces away."""
+    """Return the radiance that a path of power 1 adds to the pixel that shows its vertex; 0 if that faces away."""
     away = vertex.hit.point - params.camera_position
     distance = wp.length(away)
     view = away / wp.max(distance, 1.0e-6)

@@ -204,7 +204,7 @@ add_samples = row_launcher(add_samples_kernel, like=lambda samples, moments: mom
 # reflectance of its proxy.
 @wp.func
 def reflectance_under(radiance: wp.vec3, light: wp.vec3) -> wp.vec3:
-    """Return the reflectance of a surface of radiance ``radiance``, if a white one would have ``light``."""
+    """Return the reflectance of a surface of radiance ``radiance``; a white one in its place would have ``light``."""
     return wp.vec3(
         reflectance_of(radiance[0], wp.pi * light[0]),
         reflectance_of(radiance[1], wp.pi * light[1]),
@@ -264,7 +264,7 @@ def map_reflectance_kernel(
 
 @wp.func
 def light_of_pixel(image: LightImage, place: wp.int32, followed: wp.float32) -> wp.vec2:
-    """Return a pixel's light of paths from lights, ``followed`` of them per pixel, and its variance; one channel."""
+    """Return one channel of a pixel's light from ``followed`` paths from lights per pixel, and its variance."""
     total = wp.float32(image.sums[place]) / UNIT
     squares = wp.float32(image.squares[place]) / UNIT
     paths = followed * wp.float32(image.sums.shape[0] / 3)
@@ -368,7 +368,7 @@ def make_moments(shape: tuple[int, int], device: wp.DeviceLike) -> Moments:
 
 
 def map_reflectance(scene: LocalScene, moments: Moments, reflectance_out: wp.array2d[wp.vec3]) -> None:
-    """Write the reflectance of the proxy in every pixel, (H, W), by moments of ``IRRADIANCE``; 0 without a proxy.
+    """Write the reflectance of the proxy in every pixel, (H, W), from the task ``IRRADIANCE``'s moments; 0 without one.
 
     If proxies are glossy, ``scene.matt`` is written too.
     """

@@ -61,7 +61,7 @@ PI = wp.constant(wp.float32(math.pi))
 ALL_MODELS = tuple(sorted(map(int, (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR))))
 """All models of materials."""
 NO_DENSITY = wp.constant(wp.float32(-1.0))
-"""Value in place of the density of a direction that is not sampled: a mirror's or a camera's ray."""
+"""Value that stands for the density of a direction that is not drawn at random: a mirror's or a camera's ray."""
 LEAST_CHANCE = wp.constant(wp.float32(0.1))
 """Least probability of sampling either lobe of a surface with two; a weak lobe can carry all visible light."""
 EVEN_SHARE = 0.01
@@ -123,7 +123,7 @@ def random_triple(key: PathKey, vertex: wp.int32, stream: wp.int32) -> wp.vec3:
 
 @wp.func
 def balance(density: wp.float32, other: wp.float32) -> wp.float32:
-    """Return the balance heuristic's weight of a strategy of ``density`` against one of density ``other``."""
+    """Return the balance heuristic's weight, density / (density + other), of a sample drawn with ``density``."""
     if density < 0.0:
         return 1.0
     return density / (density + other)

@@ -69,7 +69,7 @@ def camera_ray(params: FrameParams, rays: wp.array2d[wp.vec2], key: PathKey) -> 
 
 @wp.func
 def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bool) -> PathPair:
-    """Return a path that starts on the camera's ray."""
+    """Return a path that starts on the camera's ray, for the task ``asked``; ``lobe``: of a proxy's specular lobe."""
     pair = PathPair()
     pair.path.throughput = wp.vec3(1.0, 1.0, 1.0)
     pair.path.origin = origin
@@ -84,7 +84,7 @@ def begin_path(origin: wp.vec3, direction: wp.vec3, asked: wp.int32, lobe: wp.bo
 def see(
     scene: LocalScene, asked: wp.int32, vertex: Vertex, pair: PathPair, k: wp.int32, samples_out: Round
 ) -> PathPair:
-    """Start a sample at the first surface of the camera's ray, and write the radiance that needs no path.
+    """Start sample ``k`` at the first surface of the camera's ray, and write the radiance that needs no path.
 
     ``next`` of the result is ``SURFACE`` if there is a path to follow, else ``ENDED``.
     """

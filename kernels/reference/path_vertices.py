@@ -92,7 +92,10 @@ def from_viewer(vertex: Vertex, wo: wp.vec3) -> Vertex:
 
 @functools.cache
 def make_find_vertex(trace: TraceConfig) -> wp.Function:
-    """``find_vertex(scene, origin, direction, objects) -> Vertex``: first surface, also of objects if ``objects``."""
+    """Return the function ``find_vertex(scene, origin, direction, objects) -> Vertex``: first surface on a ray.
+
+    Virtual objects count if ``objects``.
+    """
     functions = make_trace(trace)
     closest_object, closest_proxy = functions.closest_object, functions.closest_proxy
 
@@ -129,7 +132,7 @@ def make_find_vertex(trace: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_hidden_by_physical(trace: TraceConfig) -> wp.Function:
-    """``hidden_by_physical(scene, origin, direction, t_max) -> bool``: whether a proxy or a ball is in the way."""
+    """Return the function ``hidden_by_physical(scene, origin, direction, t_max) -> bool``: a proxy or ball is met."""
     occluded_by_proxies = make_trace(trace).occluded_by_proxies
 
     @wp.func(module="unique")
@@ -143,7 +146,7 @@ def make_hidden_by_physical(trace: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_see_in_frame(trace: TraceConfig) -> wp.Function:
-    """``see_in_frame(params, scene, hit) -> Seen``: a proxy's point in the frame, bilinearly interpolated."""
+    """Return the function ``see_in_frame(params, scene, hit) -> Seen``: a proxy's point in the frame, bilinearly."""
     find_in_frame = make_find_in_frame(trace)
 
     @wp.func(module="unique")
@@ -188,7 +191,7 @@ def is_glossy(scene: LocalScene, vertex: Vertex) -> wp.bool:
 
 @wp.func
 def polished(scene: LocalScene, vertex: Vertex, diffuse: wp.vec3) -> Surface:
-    """Return a glossy proxy's surface: the lobe of ``gloss`` and a diffuse part."""
+    """Return a glossy proxy's surface: its specular lobe, as the stage ``gloss`` models it, and ``diffuse``."""
     values = scene.gloss[vertex.hit.shape]
     surface = Surface()
     surface.model = wp.static(int(METALLIC_ROUGHNESS))
@@ -230,5 +233,5 @@ def make_look_up_material() -> wp.Function:
 
 @wp.func
 def is_turned(vertex: Vertex, direction: wp.vec3) -> wp.bool:
-    """Return whether a ray meets a surface from behind."""
+    """Return whether a ray of ``direction`` meets the surface at a vertex from behind."""
     return wp.dot(vertex.hit.geometric_normal, direction) >= 0.0

@@ -64,7 +64,7 @@ class Accumulate(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return passes for the change, then for the mean; neither runs in frames in which something covers a ball."""
+        """Return passes that measure the change of light, then update the mean; none runs while a ball is covered."""
         height = self.request.quality.environment_height
         view = find_view(arrays, self.wiring.reads[0].removesuffix("_radiance"))
         environment, change, params = find_view(arrays, "environment"), arrays["accumulate_change"], arrays["params"]

@@ -23,7 +23,7 @@ Rows = tuple[int, int]
 
 @dataclasses.dataclass(frozen=True)
 class Wiring:
-    """Names of the resources that a stage reads and writes."""
+    """Names of the resources (arrays and tables of a pipeline) that a stage reads and writes."""
 
     reads: tuple[str, ...]
     writes: tuple[str, ...]
@@ -88,7 +88,7 @@ class Pass:
     enabled: Callable[[], bool] | None = None
     """Predicate for the frames in which the pass runs, called once, after ``Stage.begin``; None means every frame."""
     reads: tuple[str, ...] | None = None
-    """Resources that the pass reads; on CUDA it starts when these are ready. None means all that the stage reads."""
+    """Resources that the pass reads; on CUDA it starts when these are written. None means all that the stage reads."""
     beforehand: bool = False
     """True for a host pass that CUDA frames run before all launches, so that the graph needs no cut. Earlier passes
     must not depend on its changes."""
@@ -192,7 +192,7 @@ class Stage(abc.ABC):
     converges: ClassVar[bool] = False
     """True if all methods approximate the result of the last; False if they are different models."""
     numerics: ClassVar[Numerics]
-    """Precision of its results."""
+    """Number format, and expected numerical error of its results."""
     settings: ClassVar[tuple[str, ...]] = ()
     """Settings of ``Quality`` that it shares with other stages and that change its work: ``environment_height``,
     ``edge_samples``, ``light_shadow``."""

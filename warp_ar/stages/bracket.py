@@ -39,7 +39,7 @@ class Bracket(Stage):
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the maps of all exposures, the clipped share near each texel, and the merged map."""
+        """Return the arrays of all exposures' maps, of the clipped share near each texel, and of the merged map."""
         height = self.request.quality.environment_height
         count = len(self.request.exposures)
         types = dict(zip(UNWRAPPED, (wp.vec3, wp.float32, wp.vec3), strict=True))

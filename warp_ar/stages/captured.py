@@ -75,14 +75,14 @@ class Captured(Stage):
         return [Pass(copy, on_host=True)]
 
     def resume(self, other: Stage) -> None:
-        """Keep a map that was given in place of the same file."""
+        """Take over the map of the same stage in another pipeline, if both have the same light file and size."""
         assert isinstance(other, Captured)
         before, now = other.request.scene.captured, self.request.scene.captured
         if before == now and other._radiance.shape == self._radiance.shape:
             self._radiance, self._emitters = other._radiance, other._emitters
 
     def replace(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
-        """Light the next frames with another map, at the quality's size and in the scene's axes.
+        """Replace the map that lights the next frames, at the quality's size and in the scene's axes.
 
         Args:
             radiance: Linear RGB, float32 (height, 2 height, 3); it is referenced, not copied.

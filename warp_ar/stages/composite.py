@@ -14,7 +14,7 @@ from warp_ar.stages.shared.picture import layers_of
 
 
 class Composite(Stage):
-    """Lays virtual light and virtual objects over the frame."""
+    """Composes virtual light, shadows and virtual objects over the camera's frame."""
 
     name: ClassVar[str] = "composite"
     summary: ClassVar[str] = "frame, virtual light on the receiver and virtual objects, in linear light"

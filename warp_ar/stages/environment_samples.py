@@ -21,7 +21,7 @@ from warp_ar.stages.shared.environment_sets import (
 
 
 class EnvironmentSamples(Stage):
-    """Draws directions by their radiance whenever the environment changes."""
+    """Draws directions with probabilities by their radiance, whenever the environment changes."""
 
     name: ClassVar[str] = "environment_samples"
     summary: ClassVar[str] = "directions sampled by the environment's light on the receiver"

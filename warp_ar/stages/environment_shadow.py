@@ -28,7 +28,7 @@ from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 
 def find_stride(method: Method, rows: int) -> int:
-    """Return the distance of neighbouring estimates, pixels; it grows with the square root of the frame's rows."""
+    """Return the pixels along a cell, which has one shadow estimate; they grow with the square root of frame rows."""
     return int(cell_stride(method.stride, rows, slowly=True))
 
 
@@ -96,7 +96,7 @@ class EnvironmentShadow(Stage):
         return None if reach.shadows else "no virtual object is near anything in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the ratio, and the estimates that are averaged."""
+        """Return the arrays of the shadow ratio, and of the cells' estimates that are averaged to it."""
         cells = shadow_cells(self.features)
         return {
             "shadow_ratio": ArraySpec(self.shape, wp.vec3, wp.vec3(1.0, 1.0, 1.0)),

@@ -32,7 +32,7 @@ class Expose(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring: the layers, and the evidence that the method uses for clipped pixels."""
+        """Return the wiring: the layers, and the resources from which the method estimates clipped pixels."""
         scale = features.request.scene.exposure.scale
         if not features.exposed:
             return LeftOut("exposure is 1" if scale == 1.0 else "exposure is auto and no virtual light falls")
@@ -57,7 +57,7 @@ class Expose(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return passes for the scale, the codes and the picture."""
+        """Return passes that find the exposure scale, make the table of scaled codes, and write the picture."""
         params, decode, encode = (arrays[name] for name in ("params", "decode", "encode"))
         picture = make_picture(arrays["frame"], decode, None, arrays["linear_frame"])
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]

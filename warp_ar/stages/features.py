@@ -1,4 +1,4 @@
-"""Features of a request, derived once before any stage is wired.
+"""Features of a request: properties of scene, quality and outputs, derived once before any stage is wired.
 
 Stages read features instead of each other: whether light is recovered, which layers are laid over the frame, which
 forms of the environment exist. Whether a stage has readers is not a feature; the graph finds it.
@@ -65,7 +65,7 @@ class Features:
     exposed: bool
     """True if the picture has another exposure than the camera's frame."""
     boxed: bool
-    """True if a shorter exposure uses the mean of a pixel's surroundings."""
+    """True if the method for a shorter exposure uses the mean of a clipped pixel's surroundings."""
     declipped: bool
     """True if the radiance of clipped pixels is estimated, because a shorter exposure shows it."""
     declipped_by_ball: bool
@@ -239,7 +239,7 @@ def sheds_light(scene: Scene) -> bool:
 
 
 def area_method(quality: Quality) -> str:
-    """Return the method for the light of emitting objects."""
+    """Return the quality's method for the light of emitting objects."""
     method = quality.method("area_light")
     return method if method in AREA_SAMPLES else "coarse"
 

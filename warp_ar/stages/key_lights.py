@@ -37,6 +37,6 @@ class KeyLights(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return two launches: with one row per thread, and with one thread."""
+        """Return two passes: sums over rows, one per thread, and the sum of all rows, in one thread."""
         known = arrays["environment"], arrays["key_lights_sums"], arrays["key_lights"]
         return [Pass(lambda rows: key_lights.find_key_light(*known))]

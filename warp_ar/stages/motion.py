@@ -15,7 +15,7 @@ from warp_ar.stages.features import Features
 
 
 class Motion(Stage):
-    """Projects each pixel's point by the cameras of this frame and of the previous one."""
+    """Computes motion vectors: each pixel's surface point, projected by this frame's camera and by the previous one."""
 
     name: ClassVar[str] = "motion"
     summary: ClassVar[str] = "motion of each pixel's surface since the frame before, in pixels"

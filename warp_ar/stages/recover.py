@@ -37,20 +37,21 @@ EVERY_SECONDS = 0.2
 """Seconds between later estimates, which are at least ``EVERY_FRAME`` frames apart, so that the light follows the
 switching of a lamp."""
 LATENCY = 0.1
-"""Seconds on the frames' clock after which an estimate that was computed asynchronously takes effect. The time is
-fixed, so that the same frames give the same pictures; except in real time, a frame waits for a late estimate."""
+"""Seconds of frame time from the frame that begins an estimate to the frame in which it takes effect, if no frame waits
+for the solution at once. The time is fixed, so that equal frames give equal pictures. If the estimate is late by then,
+the frame waits; in real time it does not."""
 REST = 3.0
-"""Least time between two estimates in real time, over the duration of the last one."""
+"""Least pause between two estimates in real time, divided by the time that the last one took."""
 CARD_STEP = 2
-"""Stride over the card's points (the first points) when the card is observed in every frame."""
+"""Stride over the surface points on the printed card, the first in the list, for its observation in every frame."""
 WHEN = ("now", "asked", "then")
-"""Names for the frames of the current state, of the pending estimate and of the active one."""
+"""Names of frames in array names: the current one, and those that began the pending and the active estimate."""
 MOST_EMITTERS = CONFIG.search.candidates * len(CONFIG.search.distances)
 
 
 @dataclasses.dataclass
 class _Progress:
-    """Host state of the estimates from frame to frame."""
+    """State of the estimates of clipped light on the host, kept from frame to frame."""
 
     solver: recovery.Recovery
     estimate: Estimate | None = None
@@ -81,13 +82,13 @@ class _Solved:
     cells: npt.NDArray[Any]
     """Records of ``Cell`` from which it was made."""
     solver: recovery.Recovery
-    """Solver with its updated state."""
+    """Solver with its state after the estimate."""
     seconds: float
     """Duration of the computation."""
 
 
 class Recover(Stage):
-    """Estimates the missing radiance of clipped texels from surfaces that receive the same light.
+    """Estimates the radiance that clipped texels of the environment lack, from surfaces that receive the same light.
 
     It runs after ``fill``: the light on the surfaces depends on the whole environment, including the part behind the
     ball, and filling must not spread an emitter's recovered energy into unseen directions.
@@ -128,7 +129,7 @@ class Recover(Stage):
         return Wiring((*reads, "others_filled", *kept, "probe_places"), (*writes, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the map and the arrays of the equations."""
+        """Return the arrays of the environment map with recovered light, and of the equations for that light."""
         height, others = self.request.quality.environment_height, self.features.others
         shape, most = (height, 2 * height), (CONFIG.search.most,)
         cells = cell_shape(*shape)
@@ -442,7 +443,7 @@ class Recover(Stage):
         return np.array(flat.reshape(points, count), np.float64)
 
     def _take(self, rows: Rows | None) -> None:
-        """Apply the pending estimate; if it failed, keep the previous light and replace the solver by a new one."""
+        """Apply the pending estimate; if it failed, keep the light of the previous one and make a new solver."""
         now = self._progress
         assert now.pending is not None
         pending, now.pending, now.failed = now.pending, None, ""
@@ -488,7 +489,7 @@ class Recover(Stage):
             self._progress = dataclasses.replace(other._progress)
 
     def status(self) -> Mapping[str, Any]:
-        """Return the report of the last successful estimate, and the error text of a later one that failed."""
+        """Return the report of the last good estimate, a later one's error text, and any measured ball reflectances."""
         estimate, failed = self._progress.estimate, self._progress.failed
         reason: dict[str, Any] = {"failed": failed} if failed else {}
         told = self._arrays["ball_reflectance"]()

@@ -26,7 +26,7 @@ from warp_ar.stages.shared.picture import GrowingRows
 
 @dataclasses.dataclass(frozen=True)
 class Grain:
-    """Resolution of the receiver's cells."""
+    """Resolution of the receiver's cells (blocks of pixels with one estimate each)."""
 
     samples: int
     """Samples of the environment for ambient visibility."""
@@ -138,7 +138,7 @@ class Relight(Stage):
             parts = wp.empty((*shape, threads), dtype=receiver_cells.LightPart, device=device)
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
-            """Return a function that gives the rows of cells that pixels with virtual light read, plus ``margin``."""
+            """Return a function that returns the rows of cells read by pixels with virtual light, plus ``margin``."""
 
             def extent() -> Rows:
                 start, stop = light_rows()
@@ -183,7 +183,7 @@ class Relight(Stage):
 
 
 def _keep_planes(config: RelightConfig, request: Request) -> RelightConfig:
-    """Return ``config`` for planes alone if all proxies are planes: most rays of the cells are then left out."""
+    """Return ``config`` restricted to planes if all proxies are planes, which saves most rays of the cells."""
     proxies = trace_config(request.scene).proxies
     if not set(proxies) <= {int(PLANE)}:
         return config

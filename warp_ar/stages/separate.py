@@ -25,7 +25,7 @@ too, ``reflected`` includes ``mirror_ball``."""
 
 
 class Separate(Stage):
-    """Writes the requested layers, with their neutral value where nothing virtual reaches."""
+    """Writes the requested layers, with the layer's neutral value in pixels without virtual content."""
 
     name: ClassVar[str] = "separate"
     summary: ClassVar[str] = "requested layers of the picture, and the frame as linear radiance"

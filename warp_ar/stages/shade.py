@@ -66,7 +66,7 @@ class Shade(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return one pass over the rows in which objects are or were."""
+        """Return one pass over the rows in which objects are in this frame or were in the previous one."""
         config = shade_config(self.features)
         variant = shade_variant(config, self.features, device)
         lists = make_edge_lists(arrays, device, self.name)

@@ -42,7 +42,7 @@ class Visibility(Stage):
         return {"hit_object": ArraySpec(self.shape, wp.int32, -1), "hits": ArraySpec(self.shape, Hit, Hit())}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Return one pass over the rows in which objects are or were."""
+        """Return one pass over the rows in which objects are in this frame or were in the previous one."""
         config = trace_variant(trace_config(self.request.scene), device)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
         extent = GrowingRows(arrays["object_rows"])

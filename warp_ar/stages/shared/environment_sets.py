@@ -37,7 +37,7 @@ METHODS: Mapping[str, Method] = {
 
 
 SAMPLES = 1024
-"""Least total number of samples of all sets: four per step of an 8-bit value."""
+"""Least total number of samples of all sets: four for each of the 256 values of 8 bits."""
 
 
 def lists_texels(features: Features) -> bool:

@@ -129,7 +129,7 @@ def find_receiver(
 
 
 def shade_config(features: Features) -> ShadeConfig:
-    """Return the shading configuration that a request's objects need."""
+    """Return the compile-time configuration for shading a request's objects: their materials and lights."""
     return ShadeConfig(
         distant=features.distant,
         lights=tuple(sorted({light_kind(light) for light in features.request.scene.lights})),
@@ -163,7 +163,7 @@ def relight_reads(features: Features) -> tuple[str, ...]:
 
 
 def relight_config(features: Features) -> RelightConfig:
-    """Return the configuration that relighting a request's receiver needs."""
+    """Return the compile-time configuration for adding virtual light to a request's receiver."""
     method = features.relight_method
     return RelightConfig(
         "reflectance" if method in LOCAL else method,

@@ -55,13 +55,13 @@ def box_reads(features: Features) -> tuple[str, ...]:
 
 
 def clipped_evidence(request: Request, wiring: Wiring, arrays: Arrays) -> ClippedEvidence:
-    """Return the evidence about clipped pixels that a stage with this wiring reads."""
+    """Return the ``ClippedEvidence`` (data for estimates of clipped pixels) from the resources that a stage reads."""
     known = [arrays[name] if name in wiring.reads else None for name in (SUMMED, "declipped", SUMMED_CUT)]
     return make_clipped_evidence(request.size[1], *known, levels=arrays["linear_clip"] if request.linear else None)
 
 
 class GrowingRows:
-    """Function that returns the rows of content in this frame and the previous one, which must be cleared."""
+    """Function that returns the rows with content in this frame or in the previous one, which must be cleared."""
 
     def __init__(self, current: Callable[[], Rows]) -> None:
         self._current = current
