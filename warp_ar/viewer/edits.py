@@ -125,8 +125,9 @@ _LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "pr
 _KEYS: Final = {
     *("at", "rotate", "scale", "radius", "size", "major_radius", "minor_radius", "target", "direction", "color"),
     *("intensity", "inner_angle", "outer_angle", "dictionary", "id"),
+    *("model", "base_color", "diffuse", "specular", "shininess", "metallic", "roughness"),
 }
-"""Keys that the page may set, besides those of materials. None of them names a file."""
+"""Keys of parts and materials that the page may set. None of them names a file."""
 NEW: Final[Mapping[tuple[str, str], Object | Light]] = {
     ("object", "sphere"): Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
     ("object", "box"): Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
@@ -228,10 +229,11 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
     """
     items = _items(scene, part, index) if part in _LISTS else []
     item = items[index] if items else getattr(scene, part)
-    if isinstance(item, Object) and not hasattr(item, key):
+    if key not in _KEYS or not (hasattr(item, key) or isinstance(item, Object)):
+        right = ", ".join(sorted(_KEYS & vars(item).keys()))
+        raise UsageError(f"{part}: key {key!r} cannot be edited; expected {right}")
+    if not hasattr(item, key):
         changes: dict[str, Any] = {"material": _material(_shown_material(item), key, value)}
-    elif key not in _KEYS or not hasattr(item, key):
-        raise UsageError(f"{part}: key {key!r} cannot be edited")
     else:
         changes = {key: value}
         if key in ("target", "direction"):
@@ -267,9 +269,9 @@ def _material(material: Material, key: str, value: Any) -> Material:
         if made is EmissiveMaterial and isinstance(color, Path):
             color = EmissiveMaterial.color
         return cast(Material, made(color))
-    keys = [name for name in vars(material) if name != "image"]  # a page must not name files
-    if key not in keys:
-        raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(keys)}")
+    if key not in vars(material):
+        right = ", ".join(sorted(_KEYS & vars(material).keys()))
+        raise UsageError(f"material: {type(material).__name__} has no {key}; expected {right}")
     return dataclasses.replace(material, **{key: value})
 
 
