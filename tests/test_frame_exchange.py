@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import pathlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,8 +14,7 @@ import warp as wp
 from tests.test_pipeline import SIZE, make_scene
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SceneError, UsageError
-from warp_ar.scene import bundled_scenes, dumps_scene
+from warp_ar.errors import UsageError
 from warp_ar.sources.sources import Synthetic
 
 WIDTH, HEIGHT = SIZE
@@ -221,21 +219,3 @@ def test_a_notebook_shows_the_picture(pipeline: Pipeline) -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- scenes
-
-
-def test_a_scene_is_found_by_name_and_path(tmp_path: pathlib.Path) -> None:
-    assert "desk" in bundled_scenes()
-    own = tmp_path / "mine.toml"
-    own.write_text(dumps_scene(make_scene()), encoding="utf-8")
-    for scene in (own, str(own)):
-        with Pipeline(scene, device="cpu", quality="low") as pipeline:
-            assert pipeline.size == SIZE
-    with Pipeline("desk", device="cpu", quality="low") as pipeline:
-        assert pipeline.scene.name == "desk"
-
-
-def test_what_is_no_scene_is_told() -> None:
-    with pytest.raises(UsageError, match="scene = 7: expected Scene or text or a path"):
-        Pipeline(7, device="cpu")
-    with pytest.raises(SceneError, match="nosuch"):
-        Pipeline("nosuch", device="cpu")

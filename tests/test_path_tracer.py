@@ -13,7 +13,6 @@ import pytest
 from tests.kernel_rig import look_at
 from warp_ar.accuracy import path_tracer
 from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
-from warp_ar.errors import UsageError
 from warp_ar.light.captured import CapturedEmitter, Light, latlong_directions
 from warp_ar.scene import (
     Camera,
@@ -365,23 +364,6 @@ def test_what_is_not_a_number_stays_out(device: str) -> None:
         assert (picture.radiance >= 0.0).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"seed": -1}, "seed = -1"),
-        ({"frame": np.zeros((24, 30, 3), np.uint8)}, "frame is 30x24, the picture 32x24"),
-        ({"frame": np.zeros((24, 32), np.uint8)}, "frame is uint8"),
-        ({"light": np.zeros((4, 4))}, r"light has the shape \(4, 4\)"),
-        ({"reflectances": ((0.1, 0.1, 0.1),) * 2}, "2 reflectances for 1 proxies"),
-    ],
-)
-def test_bad_arguments_are_named(change: dict[str, Any], words: str) -> None:
-    given: dict[str, Any] = {"light": WHITE, "frame": None, "seed": 0} | change
-    light, frame = given.pop("light"), given.pop("frame")
-    with pytest.raises(UsageError, match=words):
-        PathTracer(desk(), light, frame, DOWN, device="cpu", **given)
-
-
 def test_the_same_seed_gives_the_same_bits(device: str) -> None:
     """However many samples are added at a time; another seed gives others."""
     frame = np.full((32, 48, 3), 0.5, np.float32)
@@ -395,14 +377,3 @@ def test_the_same_seed_gives_the_same_bits(device: str) -> None:
     np.testing.assert_array_equal(images[0].radiance, images[1].radiance)
     np.testing.assert_array_equal(images[0].error, images[1].error)
     assert (images[0].radiance != images[2].radiance).any()
-
-
-def test_samples_lower_the_error_and_can_be_stopped(device: str) -> None:
-    tracer = PathTracer(boxes(True), latlong_sky(), None, ABOVE, device=device, reflectances=RHO, seed=1)
-    errors = [picture.relative_error for picture in tracer.render(64, step=16)]
-    assert len(errors) == 4
-    assert errors[-1] == pytest.approx(errors[0] / 2.0, rel=0.3)
-    again = PathTracer(boxes(True), latlong_sky(), None, ABOVE, device=device, reflectances=RHO, seed=1)
-    stopped = list(again.render(64, step=16, error=0.5 * (errors[1] + errors[2])))[-1]
-    assert stopped.samples == 48
-    assert stopped.relative_error == pytest.approx(errors[2])

@@ -222,24 +222,9 @@ def test_light_rect_holds_every_lit_pixel(device, name):
         assert max(shares) == 0.0
 
 
-def crowd(count: int) -> tuple[scenes.Proxy, ...]:
-    """Boxes of 2 cm in rows, turned and of several heights."""
-    side = math.ceil(math.sqrt(count))
-    return tuple(
-        scenes.Proxy(
-            "box",
-            size=(0.02, 0.02, 0.01 + 0.01 * (index % 4)),
-            at=(0.04 * (index % side) - 0.02 * side, 0.04 * (index // side) - 0.1, 0.02),
-            rotate=(0.0, 0.0, 7.0 * index),
-        )
-        for index in range(count)
-    )
-
-
 SENDING = {
     "box": PROXIES,
     "wall": (PROXIES[0], scenes.Proxy("plane", size=(1.0, 0.6), at=(0.0, 0.4, 0.3), rotate=(90.0, 0.0, 0.0))),
-    "a crowd": (*PROXIES, *crowd(25)),
 }
 
 

@@ -164,6 +164,7 @@ def test_an_edit_that_cannot_be_changes_nothing(edit, error, told, frames: Frame
 @pytest.mark.parametrize(
     ("given", "told"),
     [
+        ({"scene": 7}, "scene = 7: expected Scene or text or a path"),
         ({"quality": "lwo"}, "is no preset; did you mean low"),
         ({"quality": PRESETS["low"].with_methods(recover="shadnig")}, 'did you mean "shading"'),
         ({"outputs": None}, "outputs = None: expected a tuple"),
