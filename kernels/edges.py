@@ -66,7 +66,7 @@ def listed_edges(listed: EdgeList) -> wp.int32:
 
 @functools.cache
 def make_average_edges_kernel(weighted: bool) -> wp.Kernel:
-    """Kernel that averages the samples of every listed edge pixel, in the order of the samples.
+    """Return a kernel that averages the samples of every listed edge pixel, in the order of the samples.
 
     Args:
         weighted: If True, the fourth component is the sample's weight, 0 or 1, and not written. If False, it is
@@ -112,7 +112,7 @@ def sample_listed_edges(
         lists: Listed edges; samples are written.
         count: Samples per edge pixel.
         values_out: (H, W) vec3 if ``weighted``, else vec4; written in edge pixels only.
-        weighted: As in ``make_average_edges_kernel``.
+        weighted: True if the fourth component of a sample is its weight; only its RGB is then averaged.
     """
     device = values_out.device
     launch(kernel, EDGE_THREADS, [EDGE_THREADS, *inputs, lists.listed], [lists.samples], device=device)

@@ -131,7 +131,7 @@ def with_seen(known: wp.vec4, seen: wp.vec4) -> wp.vec4:
 
 @functools.cache
 def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel for the given kinds of proxy."""
+    """Return the kernel of ``fill_frame`` for the given kinds of proxy."""
     see_texel = make_see_texel(proxies)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -182,7 +182,7 @@ def hidden_by_balls(
 
 @functools.cache
 def make_project_corners_kernel(kinds: tuple[int, ...]) -> wp.Kernel:
-    """Kernel for scenes with proxies of these kinds, which can hide a ball: any of PLANE, BOX, MESH."""
+    """Return a kernel for scenes with proxies of these kinds, which can hide a ball: any of PLANE, BOX, MESH."""
     hidden_by_proxies = make_hidden_by_proxies(kinds)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -385,7 +385,7 @@ def pixel_footprint(
 
 @functools.cache
 def make_see_point(config: NearFieldConfig) -> wp.Function:
-    """``see_point(params, picture, scene, dfg, visible, i, j) -> SeenPoint``: point of an object in pixel (i, j)."""
+    """Return ``see_point(params, picture, scene, dfg, visible, i, j) -> SeenPoint``: an object's point in a pixel."""
     surface_at = make_surface(config.distant.models, config.distant.textures)
     side = config.side
 
@@ -468,7 +468,7 @@ def make_lobe_ray(u: wp.vec2, at: SeenPoint) -> NearRay:
 
 @functools.cache
 def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
-    """``mirror_ray(params, scene, at, k) -> NearRay``: mirror reflection of the camera ray ``k`` of a pixel."""
+    """Return ``mirror_ray(params, scene, at, k) -> NearRay``: mirror reflection of the camera ray ``k`` of a pixel."""
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
 
@@ -497,7 +497,7 @@ def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
 
 @functools.cache
 def make_pick_ray(config: NearFieldConfig) -> wp.Function:
-    """``pick_ray(params, scene, samples, places, at, n, diffuse) -> NearRay``: ray number ``n`` of a pixel.
+    """Return ``pick_ray(params, scene, samples, places, at, n, diffuse) -> NearRay``: ray number ``n`` of a pixel.
 
     The first ``diffuse`` rays go toward samples of the environment, the others into the lobe. ``places`` holds the
     positions of several balls.
@@ -545,7 +545,7 @@ def make_pick_ray(config: NearFieldConfig) -> wp.Function:
 
 @functools.cache
 def make_look_beyond(config: NearFieldConfig) -> wp.Function:
-    """``look_beyond(distant, ray) -> vec3``: the environment along a lobe's ray, filtered to the ray's width."""
+    """Return ``look_beyond(distant, ray) -> vec3``: the environment along a lobe's ray, filtered to the ray's width."""
     radiance_along = make_radiance_along(config.distant)
     width = ray_width(config)
 
@@ -679,7 +679,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
 
 @functools.cache
 def make_alpha_at(config: NearFieldConfig) -> wp.Function:
-    """``alpha_at(scene, hit, origin) -> float32``: lobe width alpha at a hit seen from ``origin``."""
+    """Return ``alpha_at(scene, hit, origin) -> float32``: lobe width alpha at a hit seen from ``origin``."""
 
     @wp.func(module="unique")
     def alpha_at(scene: RayScene, hit: Hit, origin: wp.vec3) -> wp.float32:
@@ -716,7 +716,7 @@ def fill_lobe(near: wp.vec4, transmitted: wp.vec4) -> wp.vec4:
 
 @functools.cache
 def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
-    """Kernel of ``filter_near_field``."""
+    """Return the kernel of ``filter_near_field``."""
     side = config.side
     alpha_at = make_alpha_at(config)
 

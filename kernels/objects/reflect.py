@@ -117,7 +117,7 @@ def look_up(picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec3:
 
 @wp.func
 def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> wp.vec3:
-    """Sample a layer of the frame bilinearly, with coordinates as in ``look_up``."""
+    """Sample a layer of the frame bilinearly at (x, y), pixels, within the outermost pixel centres."""
     j = wp.min(wp.int32(x), layer.shape[1] - 2)
     i = wp.min(wp.int32(y), layer.shape[0] - 2)
     fx = x - wp.float32(j)
@@ -214,7 +214,7 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
-    """``distant_irradiance(distant, point, normal) -> vec3``: the environment's irradiance; 0 if none is known."""
+    """Return ``distant_irradiance(distant, point, normal) -> vec3``: irradiance of the environment; 0 if unknown."""
     form: Literal["sh", "map"] = "sh" if config.diffuse == "sh" else "map"
     irradiance_at = make_irradiance_at(form, config.emitters, config.several)
 
@@ -233,9 +233,10 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_radiance_along(config: DistantLightConfig, captured: bool = False) -> wp.Function:
-    """``radiance_along(distant, point, direction, level) -> vec3``: prefiltered environment, with parallax correction.
+    """Return the function ``radiance_along(distant, point, direction, level) -> vec3``.
 
-    If ``captured``, it is the unfiltered environment, with emitters in the directions in which the balls show them.
+    Its result is the prefiltered environment's radiance, with parallax correction. If ``captured``, it is that of the
+    unfiltered environment, with emitters in the directions in which the balls show them.
     """
     placed = config.emitters and not captured
 
@@ -272,10 +273,11 @@ def make_radiance_along(config: DistantLightConfig, captured: bool = False) -> w
 
 @functools.cache
 def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
-    """``reflected_radiance(distant, model, roughness, shininess, point, direction, floor) -> vec3``: mean over a lobe.
+    """Return ``reflected_radiance(distant, model, roughness, shininess, point, direction, floor) -> vec3``.
 
-    The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
-    a surface that the camera sees, more for one of many rays.
+    Its result is the environment's mean radiance over a lobe. The lobe is that of a surface at ``point``, around
+    ``direction`` (unit). ``floor`` is the least level to read: 0 for a surface that the camera sees, more for one of
+    many rays.
     """
     radiance_along = make_radiance_along(config)
 

@@ -392,7 +392,7 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
 
 @functools.cache
 def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
-    """Kernel of ``shade``, specialised to ``config`` and to the treatment of edges.
+    """Return the kernel of ``shade``, specialised to ``config`` and to the treatment of edges.
 
     Args:
         config: Features of the scene.
@@ -456,7 +456,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
 
 @functools.cache
 def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
-    """Kernel that shades every sample of the listed edge pixels."""
+    """Return a kernel that shades every sample of the listed edge pixels."""
     shade_sample = make_shade_sample(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)

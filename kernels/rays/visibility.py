@@ -80,10 +80,10 @@ def make_visible_proxy(config: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_visible_cell(config: TraceConfig) -> wp.Function:
-    """``visible_cell(params, rays, scene, balls, cell, stride, margin, rect) -> Hit``: the proxy that a cell shows.
+    """Return the function ``visible_cell(params, rays, scene, balls, cell, stride, margin, rect) -> Hit``.
 
-    A cell is a block of pixels. The shape is -1 if the cell shows no proxy from its front, or if it lies more than
-    ``margin`` pixels outside ``rect``, so that no pixel reads it.
+    Its result is the hit of the proxy that a cell (block of pixels) shows. The shape is -1 if the cell shows no proxy
+    from its front, or if it lies more than ``margin`` pixels outside ``rect``, so that no pixel reads it.
     """
     visible_proxy = make_visible_proxy(config)
 
@@ -135,7 +135,7 @@ def look_within_pixel(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.in
 
 @functools.cache
 def make_sample_direction(count: int) -> wp.Function:
-    """``sample_direction(params, ray, sample) -> vec3``: direction of a pixel's sample in the world, not unit.
+    """Return ``sample_direction(params, ray, sample) -> vec3``: direction of a pixel's sample in the world, not unit.
 
     Args:
         count: Samples of a pixel, a square number; the only one is at the centre.
@@ -158,7 +158,7 @@ def make_visible(objects: wp.array, hits: wp.array) -> VisibleObjects:
 
 @functools.cache
 def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
-    """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
+    """Return the kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
     closest_visible = make_primary(config)
 
     @wp.kernel(module="unique", enable_backward=False)

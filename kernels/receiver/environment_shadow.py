@@ -436,7 +436,7 @@ def queue_rays(found: wp.uint64, begin: wp.int32, size: wp.int32, cell: wp.int32
 
 @functools.cache
 def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+    """Return the kernel specialised to ``config``; equal configs share one kernel."""
     trace = make_trace(config.distant.trace)
     closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
     chunk = min(config.count // config.partials, CHUNK)
@@ -606,7 +606,7 @@ Args:
 
 @functools.cache
 def make_trace_queue_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
-    """Kernel that finds the light that objects reflect along the queued rays."""
+    """Return a kernel that finds the light that objects reflect along the queued rays."""
     secondary_count, side = config.secondary_count, config.side
     aim = make_aim(config.emitters, config.distant.several)
     closest_object = make_trace(config.distant.trace).closest_object

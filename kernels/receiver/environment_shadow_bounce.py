@@ -144,8 +144,9 @@ def make_look_wide(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
-    """``reflect_estimated(distant, meeting, surface, before, so_far)``: ``so_far`` plus estimated light of both lobes.
+    """Return the function ``reflect_estimated(distant, meeting, surface, before, so_far) -> ReflectedLight``.
 
+    Its result is ``so_far`` plus the light that both lobes of an object reflect, found without another ray.
     The glossy lobe has at least the width ``meeting.alpha``. The receiver fills the directions below ``before.up``.
     Radiance is limited to ``before.brightest``.
     """
@@ -193,9 +194,10 @@ def make_reflect_estimated(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
-    """``reflect_traced(params, picture, scene, distant, meeting, surface, seed, so_far)``: ``so_far`` plus light.
+    """Return ``reflect_traced(params, picture, scene, distant, meeting, surface, seed, so_far) -> ReflectedLight``.
 
-    The light is a Monte-Carlo estimate by one ray into one lobe. The glossy lobe is at least ``meeting.alpha`` wide.
+    Its result is ``so_far`` plus the light that an object reflects, estimated by one random ray into one lobe. The
+    glossy lobe is at least ``meeting.alpha`` wide.
     """
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
@@ -277,7 +279,7 @@ def make_reflect_traced(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_look_before(config: DistantLightConfig) -> wp.Function:
-    """``look_before(environment, point, normal, direction) -> Before``: light on ``direction``'s side."""
+    """Return ``look_before(environment, point, normal, direction) -> Before``: light on ``direction``'s side."""
     distant_irradiance = make_distant_irradiance(dataclasses.replace(config, emitters=False))
 
     @wp.func(module="unique")
@@ -296,7 +298,7 @@ def make_look_before(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_reflect_back(config: DistantLightConfig, traced: bool) -> wp.Function:
-    """``reflect_back(params, picture, scene, distant, met, before, seed, so_far) -> ReflectedLight``.
+    """Return ``reflect_back(params, picture, scene, distant, met, before, seed, so_far) -> ReflectedLight``.
 
     The result is ``so_far`` plus the light that the object reflects. The light is found by another ray if ``traced``,
     else it is estimated from ``before``.

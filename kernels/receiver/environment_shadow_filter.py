@@ -162,7 +162,7 @@ def ratio_between(cells: ShadowCells, key: wp.int32, y: wp.float32, x: wp.float3
 
 @functools.cache
 def make_spread_ratio_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
-    """Kernel of ``spread_ratio``, specialised to ``config``."""
+    """Return the kernel of ``spread_ratio``, specialised to ``config``."""
     visible_proxy = make_visible_proxy(config.distant.trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)

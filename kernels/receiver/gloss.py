@@ -294,7 +294,7 @@ class GlossPoint:
 
 @functools.cache
 def make_see_receiver(config: GlossConfig) -> wp.Function:
-    """``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: first surface in pixel (i, j), if it is glossy."""
+    """Return ``see_receiver(params, sight, gloss, i, j) -> GlossPoint``: surface in pixel (i, j), if it is glossy."""
     closest_proxy = make_trace(config.trace).closest_proxy
 
     @wp.func(module="unique")
@@ -350,7 +350,7 @@ def draw_facet(ray: GlossRay, u: wp.vec2, wo: wp.vec3, alpha: wp.float32) -> Glo
 
 @functools.cache
 def make_draw_ray(config: GlossConfig) -> wp.Function:
-    """``draw_ray(params, sight, at, pixel, is_near, shift, sample, count) -> GlossRay``: one of ``count`` rays.
+    """Return ``draw_ray(params, sight, at, pixel, is_near, shift, sample, count) -> GlossRay``: one of ``count`` rays.
 
     If no object is near, the ray goes in the mirror direction. Otherwise a rough receiver draws a facet, by a point of
     a Hammersley set moved by ``shift``, and a mirror traces a sample of its own within the pixel.
@@ -398,7 +398,7 @@ def make_draw_ray(config: GlossConfig) -> wp.Function:
 
 @functools.cache
 def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+    """Return the kernel specialised to ``config``; equal configs share one kernel."""
     closest_proxy = make_trace(config.trace).closest_proxy
     see_receiver, draw_ray, follow = make_see_receiver(config), make_draw_ray(config), make_follow(config)
     highlights = make_highlights(config) if config.lights else None

@@ -77,7 +77,7 @@ class BallRay:
 
 @functools.cache
 def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
-    """``reflect_at_ball(scene, probes, origin, direction) -> BallRay``: a camera's ray, reflected at the first ball."""
+    """Return ``reflect_at_ball(scene, probes, origin, direction) -> BallRay``: camera ray, reflected at a ball."""
     occluded_by_proxies = make_trace(config.trace).occluded_by_proxies
 
     @wp.func(module="unique")
@@ -108,7 +108,7 @@ def make_reflect_at_ball(config: MirrorBallConfig) -> wp.Function:
 
 @functools.cache
 def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
-    """``mirrored_change(...) -> vec3``: change of a pixel's radiance, found for one camera ray along ``direction``."""
+    """Return ``mirrored_change(...) -> vec3``: change of a pixel's radiance, by one camera ray along ``direction``."""
     trace = make_trace(config.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     reflect_at_ball = make_reflect_at_ball(config)
@@ -168,7 +168,7 @@ def make_mirrored_change(config: MirrorBallConfig) -> wp.Function:
 
 @functools.cache
 def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+    """Return the kernel specialised to ``config``; equal configs share one kernel."""
     mirrored_change = make_mirrored_change(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)

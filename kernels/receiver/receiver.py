@@ -196,7 +196,7 @@ class Matter:
 
 @functools.cache
 def make_find_matter(config: RelightConfig) -> wp.Function:
-    """``find_matter(receiver, hit, key, row, col, mirror) -> Matter``: material of a point of the receiver.
+    """Return ``find_matter(receiver, hit, key, row, col, mirror) -> Matter``: material of a point of the receiver.
 
     ``key`` is the hit's ``surface_key``. The pixel (row, col) shows the hit directly if ``mirror`` is zero, else
     reflected in a ball of reflectance ``mirror``.
@@ -253,7 +253,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_respond(method: str) -> wp.Function:
-    """``respond(matter, wi, n_dot_l) -> float32``: a point's response, by one of ``METHODS`` or ``READINGS``.
+    """Return ``respond(matter, wi, n_dot_l) -> float32``: a point's response, by one of ``METHODS`` or ``READINGS``.
 
     It applies to virtual lights and to samples of emitting objects alike. ``flat`` does not read ``matter``.
     """

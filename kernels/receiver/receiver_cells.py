@@ -353,7 +353,7 @@ def sent_share(scene: RayScene, hit: Hit) -> wp.vec3:
 
 @functools.cache
 def make_sent_by_object(trace: TraceConfig) -> wp.Function:
-    """``sent_by_object(scene, lights, hit) -> vec3``: diffuse radiance of a virtual object at ``hit``.
+    """Return ``sent_by_object(scene, lights, hit) -> vec3``: diffuse radiance of a virtual object at ``hit``.
 
     Lights count as points: their shadows on objects have no penumbra.
     """

@@ -101,7 +101,7 @@ def make_area_response(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_direct_lighting(config: RelightConfig) -> wp.Function:
-    """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting`` of a hit.
+    """Return ``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting`` of a hit.
 
     The pixel (row, col) shows the hit directly if ``mirror`` is zero. Otherwise it shows the hit reflected in a mirror
     ball of reflectance ``mirror``; then values of cells are not used. ``turn`` is passed to ``visible_share``.
@@ -182,7 +182,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+    """Return the kernel specialised to ``config``; equal configs share one kernel."""
     closest_proxy = make_trace(config.trace).closest_proxy
     direct_lighting = make_direct_lighting(config)
 
@@ -255,7 +255,7 @@ def is_edge(visibility: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, col
 
 @functools.cache
 def make_sample_lighting(config: RelightConfig) -> wp.Function:
-    """``sample_lighting(params, scene, lights, receiver, row, col, sample) -> vec4``: (radiance, 1) of a sample.
+    """Return ``sample_lighting(params, scene, lights, receiver, row, col, sample) -> vec4``: (radiance, 1) of a sample.
 
     It is zero if the sample shows a ball: such samples are left out of the mean.
     """
@@ -287,7 +287,7 @@ def make_sample_lighting(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp.Kernel:
-    """Kernel that finds edge pixels and samples them at once; if ``left``, only when the list of edges overflowed."""
+    """Return a kernel that finds edge pixels and samples them; if ``left``, only when the list of edges overflowed."""
     sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -343,7 +343,7 @@ def list_edges_kernel(
 
 @functools.cache
 def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel that computes every sample of the listed edge pixels."""
+    """Return a kernel that computes every sample of the listed edge pixels."""
     sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)

@@ -57,7 +57,7 @@ class Surfaces:
 
 @functools.cache
 def make_physical_surface(config: TraceConfig) -> wp.Function:
-    """``physical_surface(scene, balls, origin, direction) -> Surface``: the proxy or ball that a ray meets.
+    """Return ``physical_surface(scene, balls, origin, direction) -> Surface``: the proxy or ball that a ray meets.
 
     ``direction`` is scaled so that its component along the camera's axis is 1.
     """
@@ -97,7 +97,7 @@ def make_physical_surface(config: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_trace_surfaces_kernel(config: TraceConfig) -> wp.Kernel:
-    """Kernel of ``trace_surfaces``, specialised to the kinds of shape that exist."""
+    """Return the kernel of ``trace_surfaces``, specialised to the kinds of shape that exist."""
     physical_surface = make_physical_surface(config)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -180,7 +180,7 @@ def sort_ranks(ranks: vec8) -> vec8:
 
 @functools.cache
 def make_shown(config: TraceConfig) -> wp.Function:
-    """``shown(scene, balls, origin, direction) -> int32``: index of the surface that a camera's ray shows, or -1."""
+    """Return ``shown(scene, balls, origin, direction) -> int32``: index of a camera ray's first surface, or -1."""
     closest_visible = make_primary(config)
     physical_surface = make_physical_surface(config)
 
@@ -198,7 +198,7 @@ def make_shown(config: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_count_coverage_kernel(config: TraceConfig, edge_samples: int) -> wp.Kernel:
-    """Kernel of ``count_coverage``, specialised to the kinds of shape that exist and to the samples of a pixel."""
+    """Return the kernel of ``count_coverage`` for the kinds of shape that exist and the samples of a pixel."""
     check_edge_samples(edge_samples)
     shown, sample_direction = make_shown(config), make_sample_direction(edge_samples)
 

@@ -140,7 +140,7 @@ def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp
 
 @functools.cache
 def make_observe_surfaces_kernel(proxies: tuple[int, ...], linear: bool = False) -> wp.Kernel:
-    """Kernel of ``observe_surfaces`` for the given kinds of proxy, of frames of 8-bit codes or ``linear`` ones."""
+    """Return the kernel of ``observe_surfaces`` for kinds of proxy, and frames of 8-bit codes or ``linear`` ones."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
     pixel = wp.vec3 if linear else wp.vec3ub
     to_light = keep_linear if linear else decode
@@ -232,7 +232,7 @@ Args:
 # parallax error. Cells below the surface's horizon have a negative cosine and are left out.
 @functools.cache
 def make_trace_transfer_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel of ``trace_transfer`` for the given kinds of proxy."""
+    """Return the kernel of ``trace_transfer`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -302,7 +302,7 @@ Args:
 
 @functools.cache
 def make_trace_emitters_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel of ``trace_emitters`` for the given kinds of proxy."""
+    """Return the kernel of ``trace_emitters`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -60,7 +60,7 @@ def trust(confidence: wp.float32) -> wp.float32:
 
 @functools.cache
 def make_leave_out_edges_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel for the given kinds of proxy."""
+    """Return the kernel of ``leave_out_edges`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -121,7 +121,7 @@ Args:
 
 @functools.cache
 def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel for the given kinds of proxy."""
+    """Return the kernel of ``condense_cells`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -347,7 +347,7 @@ class SeenProxy:
 
 @functools.cache
 def make_see_proxy(trace: TraceConfig) -> wp.Function:
-    """``see_proxy(params, scene, vertex) -> SeenProxy``: radiance and reflectance of a proxy's point."""
+    """Return ``see_proxy(params, scene, vertex) -> SeenProxy``: radiance and reflectance of a proxy's point."""
     see_in_frame = make_see_in_frame(trace)
 
     @wp.func(module="unique")
@@ -472,7 +472,7 @@ def leave_surface(pair: PathPair, direct: DirectLight, following: PathState) -> 
 # computed for one after another by the same code: a copy for each would make the kernel larger, and NVRTC slower.
 @functools.cache
 def make_scatter(trace: TraceConfig) -> wp.Function:
-    """``scatter(scene, kind, hit, surface, pair, key) -> PathPair``: add direct light, and draw the next ray.
+    """Return ``scatter(scene, kind, hit, surface, pair, key) -> PathPair``: add direct light, and draw the next ray.
 
     Mirrors get no direct light. A path that carries a difference gets the change of direct light by virtual content.
     The two ways to draw a direction to the environment, or to the disk of a light, are combined by the balance
@@ -585,7 +585,7 @@ def take_seen(pair: PathPair, seen: SeenProxy) -> PathPair:
 
 @functools.cache
 def make_visit(trace: TraceConfig) -> wp.Function:
-    """``visit(params, scene, vertex, pair, key) -> PathPair``: scattering of a path at the surface that it met."""
+    """Return ``visit(params, scene, vertex, pair, key) -> PathPair``: a path, scattered at the surface that it met."""
     scatter, see_proxy, look_up_material = make_scatter(trace), make_see_proxy(trace), make_look_up_material()
 
     @wp.func(module="unique")

@@ -278,7 +278,7 @@ def add_to_pixels(
 
 @functools.cache
 def make_follow_lights_kernel(trace: TraceConfig) -> wp.Kernel:
-    """Kernel of ``follow_lights`` for the kinds of shape in ``trace``."""
+    """Return the kernel of ``follow_lights`` for the kinds of shape in ``trace``."""
     find_vertex, see_proxy = make_find_vertex(trace), make_see_proxy(trace)
     hidden_by_physical, look_up_material = make_hidden_by_physical(trace), make_look_up_material()
     occluded_by_objects = make_trace(trace).occluded_by_objects

@@ -11,8 +11,8 @@ that every direction with light has samples.
 Near emitters. The texels that show an emitter at a known distance D are taken out of the distant environment, less the
 radiance around them, and placed on a sphere of radius D around the point that reflects the emitter. Seen from a point
 at distance d, a texel has D^2 cos / d^2 times its solid angle, cos between the ray and the sphere's normal, and 1 / cos
-times its radiance: emitters have the same intensity in all directions, as in ``emitters``. They hide nothing. A fixed
-share of directions, ``near_share``, is drawn toward them, by their light.
+times its radiance: emitters have the same intensity in all directions. They hide nothing. A fixed share of directions,
+``near_share``, is drawn toward them, by their light.
 
 Surfaces. A lobe is chosen with a probability proportional to its reflectance: the cosine for the diffuse part, visible
 half vectors for GGX, the lobe itself for Phong. Reflection is that of ``materials``; this module adds the densities
@@ -214,7 +214,7 @@ def sky_radiance(sky: Sky, direction: wp.vec3, density: wp.float32) -> wp.vec3:
 
 @wp.func
 def near_radiance(sky: Sky, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, density: wp.float32) -> wp.vec3:
-    """Return the radiance of near emitters on a ray before ``t_max``, weighted as in ``sky_radiance``."""
+    """Return the radiance of near emitters on a ray before ``t_max``, weighted for a ray drawn with ``density``."""
     radiance = wp.vec3(0.0, 0.0, 0.0)
     height = sky.radiance.shape[0]
     width = sky.radiance.shape[1]

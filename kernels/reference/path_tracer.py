@@ -134,7 +134,7 @@ def write_sample(pair: PathPair, k: wp.int32, samples_out: Round):
 # no faster.
 @functools.cache
 def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
-    """Kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
+    """Return the kernel of ``trace_paths`` for the kinds of shape in ``trace``."""
     find_vertex, visit = make_find_vertex(trace), make_visit(trace)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -186,7 +186,7 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
 
 @functools.cache
 def make_find_shown_kernel(trace: TraceConfig) -> wp.Kernel:
-    """Kernel of ``find_shown`` for the kinds of shape in ``trace``."""
+    """Return the kernel of ``find_shown`` for the kinds of shape in ``trace``."""
     find_vertex = make_find_vertex(trace)
 
     @wp.kernel(module="unique", enable_backward=False)

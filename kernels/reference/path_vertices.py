@@ -205,7 +205,7 @@ def polished(scene: LocalScene, vertex: Vertex, diffuse: wp.vec3) -> Surface:
 
 @functools.cache
 def make_look_up_material() -> wp.Function:
-    """``look_up_material(scene, vertex, wo, reflectance) -> Surface``: material of a vertex seen from ``wo``.
+    """Return ``look_up_material(scene, vertex, wo, reflectance) -> Surface``: material of a vertex seen from ``wo``.
 
     ``reflectance`` is used for a proxy. No other function reads how objects' materials are stored.
     """

@@ -84,7 +84,7 @@ HEIGHT_COST = 8e3
 CORRELATED = 50.0
 """Number of neighbouring samples that count as one independent sample."""
 MOST_DEVIATION = 6e-4
-"""Largest standard deviation of an accepted fit, metres; a ruler is as good."""
+"""Largest standard deviation of an accepted fit, metres: that of a measurement with a ruler."""
 MOST_ERROR = 0.36
 """Largest mean cost at which the frames count as explained: 0.1 to 0.2 on path-traced scenes, 0.3 for a small ball in
 compressed video, 0.3 to 0.6 at wrong positions."""
@@ -96,7 +96,7 @@ DESK = Proxy("plane", size=(2.0, 2.0))
 """Plane around the marker that is assumed for a scene without proxies."""
 REFINE_VIEWS = 3
 REFINE_SEARCH = 0.006
-"""Search radius in metres: as accurate as a ruler, and a smaller radius takes less time."""
+"""Half width of the search, metres: the error of a position that was measured with a ruler."""
 UNMODELLED = 0.02
 """Square root of radiance by which even a correct prediction may be wrong, for example by specular reflection; on a
 uniform receiver it keeps the covariance large."""
@@ -140,7 +140,7 @@ class BallFit:
     samples: int
     """Number of pixels that were used."""
     rival: float
-    """Smallest cost at the distance ``RIVAL_DISTANCE``."""
+    """Smallest cost of centres at the distance ``RIVAL_DISTANCE`` from the fitted one."""
 
     @property
     def is_good(self) -> bool:
@@ -194,7 +194,7 @@ class BallView:
         return pixels, _within(pixels, 2.0, (self.camera.width - 3, self.camera.height - 3))
 
     def disc(self, center: Array, radius: float, across: int) -> Array:
-        """Return the pixels of samples on a ball, (n, 2)."""
+        """Return the pixels of samples on a ball's disc, (n, 2), at most ``across`` along its diameter."""
         c = self.pose.apply(center)
         if c[2] < 2 * radius:
             return np.zeros((0, 2))
@@ -253,7 +253,7 @@ _Samples = tuple[Array, Array]
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """Views and ball of one fit, with its cost function."""
+    """One fit: the views and the ball, and the cost of a centre."""
 
     views: Sequence[BallView]
     probe: Probe
@@ -379,7 +379,7 @@ def fit_ball(
         search: Half width in metres, along x and y, of the searched region around the approximate centre.
 
     Returns:
-        The fit, or None if too little of the receiver is mirrored. Check ``is_good`` before using it.
+        The fit, or None if the ball mirrors too little of the receiver. Check ``is_good`` before using it.
     """
     fine = _Task(prepare_views(frames, camera), probe, _Receiver(proxies, others))
     coarse = dataclasses.replace(fine, is_coarse=True)
@@ -418,7 +418,7 @@ def prepare_views(frames: Sequence[tuple[Image, Pose]], camera: Camera) -> tuple
 def mirrored_error(
     views: Sequence[BallView], probe: Probe, proxies: Sequence[Proxy] = (), others: Sequence[Probe] = ()
 ) -> tuple[float, Array] | None:
-    """Return how badly a ball of a given radius explains its mirror image in the frames, at the best nearby centre.
+    """Return the least mean cost of a ball of a given radius, by its mirror image in the frames, and the best centre.
 
     Args:
         views: The frames.
@@ -427,7 +427,7 @@ def mirrored_error(
         others: Other balls.
 
     Returns:
-        Mean cost, 0 (all samples agree) to 1, and the centre (3,); None if too little of the receiver is mirrored.
+        Mean cost, 0 (all samples agree) to 1, and the centre (3,); None if the ball mirrors too little of the receiver.
     """
     task = _Task(views, probe, _Receiver(proxies, others))
     center: Array = np.array(probe.center, np.float64)
@@ -460,7 +460,7 @@ def mirrored_radius(
     balls: dict[int, Probe] = {}
 
     def attempt(k: int, place: tuple[float, float, float]) -> None:
-        """Evaluate radius number ``k`` from an initial centre, with the ball still on the ground."""
+        """Store the least cost of radius number ``k`` and its ball, searched from a place at which the ball stands."""
         radius = probe.radius * (1.0 + RADIUS_STEP * k)
         start = (place[0], place[1], probe.center[2] + radius - probe.radius)
         ball = dataclasses.replace(probe, center=start, radius=radius)
@@ -533,7 +533,7 @@ def posed_frames(source: Source, marker: Marker, camera: Camera, most: int) -> l
 
 
 def refine_balls(scene: Scene, source: Source, *, frames: int = 24) -> tuple[Scene, tuple[BallFit | None, ...]]:
-    """Return the scene with its balls where the frames show them, as far as that is certain.
+    """Return the scene with each ball at the position that the frames show, if that position is certain.
 
     Args:
         scene: Scene whose balls are accurate to 6 mm.

@@ -51,7 +51,7 @@ STARTS = 4
 """Number of candidates from which a search descends, because a mirrored edge often gives a stronger circle than the
 rim."""
 SEARCHED = 1600.0
-"""Longer side in pixels of the picture in which a ball is searched."""
+"""Longer side in pixels to which a picture is reduced before a ball is searched in all of it."""
 DIM_SUPPORT = 0.4
 """Visible share of the rim below which a person should check the result."""
 TINY = 24.0
@@ -65,15 +65,15 @@ LEAST_EVIDENCE = 6.0
 UNSURE = 0.02
 """Largest standard deviation of position and radius, relative to the radius, of an outline without doubt."""
 STRAY = 0.026
-"""Largest stray of an outline without doubt, relative to the radius."""
+"""Largest ``BallOutline.stray`` of an outline without doubt, relative to the radius."""
 STRAY_PIXELS = 2.0
-"""Stray in pixels below which it is noise."""
+"""``BallOutline.stray`` in pixels below which it is noise."""
 STRAY_REACH = 0.08
 """Distance from an outline, relative to the radius, in which other edges are searched."""
 STRAY_RADIUS = 160.0
-"""Radius in pixels of the ball in the picture in which they are searched."""
+"""Radius in pixels of the ball in the reduced picture in which these other edges are searched."""
 MISFIT = 0.6
-"""Largest misfit of a mirror ball."""
+"""Largest ``BallOutline.misfit`` of a mirror ball."""
 DARK = 6.0
 """Code below which a lifted picture is not logarithmic, because of noise."""
 LARGEST_RADIUS = 700.0
@@ -257,7 +257,7 @@ def _reduced(image: Image, camera: Camera, share: float) -> tuple[Image, Camera]
 
 
 def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: float) -> Array:
-    """Return the sphere with the most rim whose outline is within ``shift`` pixels in every unknown."""
+    """Return the sphere with the strongest rim, whose outline is moved by up to ``shift`` pixels in every unknown."""
     slopes, fit = gradients(image), _Fit(image, camera, sphere, math.ceil(2.0 * shift))
 
     def compressions(moves: Array) -> Array:
@@ -482,8 +482,9 @@ def _find_anywhere(image: Image, camera: Camera) -> BallOutline:
 def _examined(image: Image, camera: Camera, outline: BallOutline) -> BallOutline:
     """Return an outline with its stray and its misfit.
 
-    Circles are tried all around. From the best of them and from the outline itself, ellipses are fitted to the steps:
-    a ball's outline is one under a perspective that is not the assumed one, and so are many objects'.
+    Circles are tried all around. From the best of them and from the outline itself, ellipses are fitted to the steps in
+    the picture. A ball's outline is such an ellipse if the true perspective is not the assumed one. Outlines of many
+    other objects are ellipses too.
     """
     size = STRAY_RADIUS / max(outline.radius, STRAY_RADIUS)
     small, view = _reduced(image, camera, size)

@@ -1,4 +1,4 @@
-"""Centre and radius of a mirror ball with reliable intervals: first by its outlines, then by its mirror image.
+"""Centre and radius of a mirror ball with reliable error intervals: first by outlines, then by the mirror image.
 
 The mirror image of the receiver gives the centre to a fraction of a millimetre, but only for the assumed radius. A
 radius error of 1 mm moves that centre by ``SLOPE`` millimetres, mostly along the line of sight, and its own interval

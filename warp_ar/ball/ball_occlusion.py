@@ -35,7 +35,7 @@ from warp_ar.tracking.drift import codes_around, still_points, under_boxes
 Array = NDArray[np.float64]
 
 QUIET = 0.15
-"""Largest median change of all points, as a logarithm; a tracked gain and a tone curve leave 0.1."""
+"""Largest median change of all points, as a logarithm, under unchanged light; errors of gain and tone curve are 0.1."""
 CHANGED = 0.4
 """Logarithm, in the channel with the largest change, from which a point or a cell counts as changed."""
 NEAR_SHARE = 0.15
@@ -43,11 +43,11 @@ NEAR_SHARE = 0.15
 DISC_SHARE = 0.15
 """Share of changed cells of a ball's disc from which it may be covered."""
 EVERY = 3
-"""Stride through the scene's static points."""
+"""Stride through the points on the card and on planes that do not move."""
 LEAST_POINTS = 24
-"""Smallest number of points, in all, that must be visible again."""
+"""Smallest number of points that this frame and an earlier one must both show, for a test."""
 LEAST_NEAR = 8
-"""Smallest number of points next to a ball that must be visible again."""
+"""Smallest number of points next to a ball that this frame and an earlier one must both show."""
 PATIENCE = 1.5
 """Seconds after which an occluder counts as part of the scene."""
 MEMORY = 0.3
@@ -72,7 +72,7 @@ class BallOcclusion:
     """Detector of occluded mirror balls over the frames."""
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
-        """Choose points.
+        """Choose the points on the card and on planes that are compared between frames.
 
         Args:
             scene: Scene with a marker and a ball.
@@ -114,7 +114,7 @@ class BallOcclusion:
         gain: Array,
         deep: DeepFrame | None = None,
     ) -> bool:
-        """Test a frame.
+        """Test whether an object covers a ball in a frame, and remember the frame.
 
         Args:
             image: uint8 RGB (height, width, 3).

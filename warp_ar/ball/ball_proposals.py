@@ -61,7 +61,7 @@ def _edges(image: Image) -> tuple[Array, Array]:
 
 
 def _vote(places: Array, ways: Array, radius: float, size: tuple[int, int]) -> tuple[Array, float, float]:
-    """Return the share of a rim of ``radius`` around each position: a grid, its cell size in pixels, and its margin.
+    """Return a grid of the share of a rim of ``radius`` around each position, its cell size in pixels, and its margin.
 
     ``size`` is the picture's (height, width). Votes of each eighth are limited to that eighth of a rim.
     """

@@ -45,12 +45,12 @@ BLUR_SIZE: Final = 2 * BLUR_REACH + 1
 FEWEST: Final = 200
 """Smallest number of usable pixels."""
 SCATTER: Final = 0.2
-"""Largest standard deviation of one pixel's logarithm; above it, the two views show different things."""
+"""Largest standard deviation, over pixels, of the ratio's logarithm; above it, both views show different surfaces."""
 ALIKE: Final = 0.6
-"""Smallest correlation of the logarithms of both views."""
+"""Smallest correlation, over pixels, of the logarithms of mirrored and direct radiance."""
 HALVES: Final = 0.15
-"""Largest difference of logarithms between halves of the pixels: at most 0.11 on matt tables and the clips, 0.26 and
-more on three of four polished tables."""
+"""Largest difference of the ratio's logarithm between halves of the ball: at most 0.11 on matt tables and the clips,
+0.26 and more on three of four polished tables."""
 LEAST_DEVIATION: Final = 0.025
 """Systematic error of the logarithm, from the ball's position and radius."""
 REFLECTANCE: Final = 0.12
@@ -83,7 +83,7 @@ def measure_reflectance(
         table: Linear value of each code, (256, 3).
 
     Returns:
-        The reflectance; None if the ball mirrors too few directly visible points, or both views differ.
+        The reflectance; None if the ball mirrors too few directly visible points, or the two views disagree.
     """
     image, pose = view
     mirrored, points = _mirrored_points(scene, camera, probe, pose)

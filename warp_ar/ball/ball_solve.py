@@ -100,7 +100,7 @@ def rough_circle(camera: Camera, pose: Pose, probe: Probe) -> tuple[float, float
 def standing_ground(probe: Probe, proxies: Sequence[Proxy]) -> float | None:
     """Return the height in metres of the surface on which the ball stands.
 
-    Return None if the scene's ball floats or has none.
+    Return None if the scene's ball floats, or has no horizontal plane below it.
     """
     ground = ground_below(probe, proxies)
     return ground if ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius else None

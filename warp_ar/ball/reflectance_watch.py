@@ -54,7 +54,7 @@ class ReflectanceWatch:
         return self.values != tuple(probe.reflectance for probe in self._scene.probes)
 
     def observe(self, image: NDArray[np.uint8], pose: Pose, probes: Sequence[Probe]) -> bool:
-        """Measure in a frame.
+        """Measure the balls' reflectances in a frame, and update ``values``.
 
         Args:
             image: uint8 RGB (height, width, 3).

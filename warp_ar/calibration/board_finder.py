@@ -36,7 +36,7 @@ STRAIGHT: Final = 0.04
 """Largest median distance, in marker sides, between a layout's corners and the detected ones. Lens distortion stays
 below it; a wrong layout exceeds it several times."""
 BENT: Final = 0.3
-"""Largest median distance for a fisheye: up to 0.23 for a right layout, 0.7 or more for a wrong one."""
+"""Value of ``STRAIGHT`` for a fisheye: the distance is up to 0.23 for a right layout, 0.7 or more for a wrong one."""
 
 
 def find_markers(image: Image) -> tuple[str, list[Detection]]:

@@ -33,7 +33,7 @@ def card_size(marker: Marker) -> tuple[float, float]:
 
 
 def draw_card(marker: Marker, pixels_per_metre: float) -> Image:
-    """Draw the marker or board with a white margin of at least one cell, each edge at its nearest pixel.
+    """Draw the marker or board with a white margin of at least one cell, edges rounded to whole pixels.
 
     Args:
         marker: what to draw.

@@ -25,11 +25,11 @@ FITS: Final = 0.03
 """Root mean square error, relative to white, up to which a matrix is used: 0.005 by noise, 0.02 if the light changes by
 10 % across the chart, 0.025 by a phone's tone curve. The errors of the matrix are about four times as large."""
 WRONG: Final = 0.1
-"""Such an error above which the patches are not those of a chart: 0.35 where none was found properly."""
+"""Root mean square error, relative to white, from which the patches are not a chart's: 0.35 where one was misplaced."""
 
 
 def measure_chart(image: NDArray[np.uint8], codes: NDArray[np.float32], name: str) -> tuple[Array, str]:
-    """Return the matrix from camera values to linear sRGB, (3, 3), by the colour chart in a photograph, and a note.
+    """Return the matrix from camera values to linear sRGB, (3, 3), by a chart in a photograph, and a note on its fit.
 
     Args:
         image: uint8 RGB, with the chart evenly lit.

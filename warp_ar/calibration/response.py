@@ -274,7 +274,7 @@ def _log_curve(code: Array, terms: Array) -> Array:
 def _reflected(share: Array, black: float, spread: float) -> Array:
     """Return the logarithm of the reflectance of an ink share relative to white paper.
 
-    ``spread`` is the gain at one half.
+    ``spread`` is the coverage that the spread of ink adds to a share of one half.
     """
     inked = np.clip(share + 4.0 * spread * share * (1.0 - share), 0.0, 1.0)
     return np.log(1.0 - inked * (1.0 - black))
@@ -325,7 +325,7 @@ def _solve(found: list[_Samples], channel: int) -> tuple[Array, Array]:
 
 
 def _joined(found: list[_Samples], channel: int) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
-    """Return picture index, position, share, code (0 to 1) and ``EVEN`` of all usable samples."""
+    """Return picture index, position, share of ink, code (0 to 1) and deviation (``EVEN``) of all usable samples."""
     view = np.concatenate([np.full(len(samples.shares), k) for k, samples in enumerate(found)])
     places, shares = (np.concatenate([getattr(samples, name) for samples in found]) for name in ("places", "shares"))
     codes = np.concatenate([samples.codes[:, channel] for samples in found])

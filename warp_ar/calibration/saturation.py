@@ -48,7 +48,7 @@ FULL = 255
 LEAST_LEVEL = 200
 """Smallest code accepted as a saturation level."""
 NEAR_FULL = 253
-"""Level from which on the default is meant, because codecs lower 255 by one or two."""
+"""Code from which on a plateau counts as 255, because codecs lower 255 by one or two."""
 LEAST_PIXELS = 8
 """Smallest number of the ball's pixels on a plateau."""
 LEAST_SHARE = 1e-3
@@ -66,7 +66,7 @@ LUMA = np.array([0.299, 0.587, 0.114])
 RINGING = 17
 """Largest overshoot in codes above a plateau, by compression."""
 LEAST_HEAP = 2e-4
-"""Share of the whole picture with codes 254 and 255 if a channel saturates there."""
+"""Least share of the picture's pixels with codes 254 and 255 that shows that a channel saturates at 255."""
 INSIDE = 0.95
 """Share of the ball's radius within which pixels certainly belong to the ball."""
 WATCHED = 24
@@ -109,8 +109,8 @@ class SaturationLevels:
         self._tops: list[tuple[int, float]] = []
         self._stays: int | None = None
         self._guess: bool | None = None
-        """True if the levels are provisional, from a top before any drift; None: none was tried; False: it was
-        withdrawn."""
+        """True if the levels are provisional, from ``luma_top`` before any change of gain; None: none was tried; False:
+        it was withdrawn, or a plateau was found."""
 
     def observe(
         self,
@@ -165,7 +165,7 @@ class SaturationLevels:
         return bool((before != self.levels).any())
 
     def _may_be_level(self, image: NDArray[np.uint8], top: int) -> bool:
-        """Return True if a concentration of luma at a code may be the level before any change of gain."""
+        """Return True if the code ``top`` may be the saturation level, by the brighter pixels of one frame."""
         if self._guess is not None or (self.levels != FULL).any():
             return False
         brighter = float((image[::2, ::2] @ LUMA > top + RINGING // 2).mean())
@@ -173,7 +173,7 @@ class SaturationLevels:
         return bool(self._guess)
 
     def _unmoved(self, top: int | None, gain: float) -> int | None:
-        """Return the code at which luma saturates for all gains; None if still unknown."""
+        """Return the code at which luma saturates for all gains so far; None if frames or gains are too few to tell."""
         if top is None:
             return None
         self._tops = [*self._tops, (top, float(np.log(max(gain, 1e-6))))][-WATCHED:]
@@ -243,7 +243,7 @@ def luma_plateau(codes: NDArray[np.uint8]) -> int | None:
 def luma_top(codes: NDArray[np.uint8]) -> int | None:
     """Return the code around which the luma of the brightest pixels is concentrated.
 
-    Return None if not, or at the usual level.
+    Return None if it is not concentrated, or if it is concentrated near code 255.
 
     Args:
         codes: Pixels, (n, 3).

@@ -33,7 +33,7 @@ _LARGEST: Final = 256
 
 
 class AreaTable(NamedTuple):
-    """Input of the area lights of ``structs.RayScene``."""
+    """Emitting objects and their faces, with sampling probabilities, for ``structs.RayScene``."""
 
     lights: npt.NDArray[Any]
     """Records of ``structs.AreaLight``, one per object that emits."""

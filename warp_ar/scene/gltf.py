@@ -265,7 +265,7 @@ _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0
 _SAME_COLOR: Final = 2
 """Largest change of 8-bit codes by an ICC profile that counts as sRGB itself."""
 _MOST_IMAGES: Final = 4
-"""Most pixels of all pictures of a file together, as a multiple of the largest picture."""
+"""Most pixels of all pictures of a file together, as a multiple of the limit for one picture."""
 _MOST_PLACES: Final = 20_000
 """Most nodes of a file, and most placed primitives."""
 _COMPRESSED: Final = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")

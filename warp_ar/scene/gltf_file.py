@@ -174,7 +174,7 @@ class GltfFile:
         return data
 
     def _view_bytes(self, number: object, what: str) -> tuple[memoryview, int]:
-        """Return the bytes of a buffer view and its stride; a stride of 0 means that it gives none."""
+        """Return the bytes of a buffer view and its stride; 0 means that the view gives no stride."""
         views = self.objects("bufferViews")
         item = views[self.index(number, len(views), f"{what} lies in buffer view")]
         label = f"buffer view {number}"

@@ -1,6 +1,6 @@
 """Kinds of shapes, materials and lights of a scene, which decide the kernels and arrays to make.
 
-Numbers are left out.
+Numbers, such as positions and colours, decide neither.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A mesh file and the files that it refers to, checked before they are read.
 
-A material library, buffer or texture may be missing, a pipe that never ends, or a picture whose header promises more
-pixels than fit into memory.
+These files (material library, buffers, textures) may be missing. One may be a pipe that never ends, or a picture whose
+header promises more pixels than fit into memory.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class MeshSource:
         return self.known[name]
 
     def picture(self, name: str, *, color: bool = False) -> npt.NDArray[np.uint8]:
-        """Return a referenced picture, RGBA; ``color`` is as in `decode_rgba`.
+        """Return a referenced picture, RGBA; if ``color``, its colours are converted by its ICC profile.
 
         Raises:
             SceneError: The picture is missing, damaged or too large.

@@ -33,8 +33,7 @@ FLAT: Final = 1e-12
 """Cross product at a corner, as a share of the polygon's squared size, below which the corner is straight: float64
 rounding."""
 _UNCOLORED: Final = (0.8, 0.8, 0.8, 1.0)
-"""Linear colour of faces without colour in a file where other faces have one; the same as that of meshes without
-colours."""
+"""Linear colour of faces without colour in a file where other faces have one. Meshes without colours have it too."""
 
 
 @dataclasses.dataclass

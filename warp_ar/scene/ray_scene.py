@@ -312,9 +312,10 @@ class HostScene:
     def write_proxies(
         self, records_out: npt.NDArray[Any], places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
-        """Write the records of proxies at the places of their markers.
+        """Write the records, of ``structs.Shape``, of proxies at the places of their markers.
 
-        ``write_objects`` describes the arguments and the result.
+        ``places`` holds ``world_from_marker`` of every such marker, None for a lost one. Return True if any record
+        differs from its former content.
         """
         for record, fixed, item in zip(self._proxies, self._fixed_proxies, self.scene.proxies, strict=True):
             if item.marker is not None:
@@ -352,7 +353,11 @@ class HostScene:
     def write_lights(
         self, records_out: npt.NDArray[Any], seconds: float, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
-        """Write the virtual lights' records for a time; ``write_objects`` describes the arguments and the result."""
+        """Write the virtual lights' records, of ``structs.Light``, for a time since the first frame.
+
+        ``places`` holds ``world_from_marker`` of every marker to which lights are attached, None for a lost one. Return
+        True if any record differs from its former content.
+        """
         for record, light in zip(self._lights, self.scene.lights, strict=True):
             if light.animate is None and light.marker is None and seconds != 0.0 and not self._lights_edited:
                 continue

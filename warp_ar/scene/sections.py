@@ -54,13 +54,13 @@ They work with a warning for one minor version."""
 
 
 class SceneTable(Table):
-    """One table of a scene file."""
+    """One section (a TOML table) of a scene file."""
 
     world: Marker | None = None
     """Marker of the world frame, or None."""
 
     def __init__(self, label: str, files: SceneFiles, section: str, data: object, keys: Sequence[str]) -> None:
-        """Check the keys; arguments and errors as in `Table`, with a resolver of paths in place of the folder."""
+        """Check the keys; arguments are those of `Table`, but ``files`` resolves paths instead of a folder."""
         place = re.sub(r"\[\d+\]", "", section)
         if isinstance(data, dict):
             for old in [key for key in data if f"{place}.{key}" in RENAMED]:

@@ -1,4 +1,4 @@
-"""Tables of a TOML file: checked values, and errors that name file, key, value and allowed values."""
+"""Sections (tables) of a TOML file: checked values, and errors that name file, key, value and allowed values."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Table:
                 raise self.error(f"{label}: {self.name(key)}: unknown key; {nearest(key, keys)}")
 
     def inner(self, key: str, data: object, keys: Sequence[str]) -> Self:
-        """Return the table under a key of this one."""
+        """Return the inner table under ``key``, whose parsed value is ``data``; ``keys`` are allowed in it."""
         return type(self)(self.label, self.folder, self.name(key), data, keys)
 
     def __contains__(self, key: str) -> bool:
@@ -62,7 +62,7 @@ class Table:
     def only(self, kind: str, uses: dict[str, tuple[str, ...]]) -> None:
         """Raise an error for keys that other kinds of this section use, but not this kind.
 
-        ``kind`` is the key that names it.
+        ``kind`` is the key that names the section's kind, ``uses`` the keys of each kind.
         """
         own = sorted(set(uses[self.data[kind]]))
         for key in self.data:
@@ -118,6 +118,6 @@ class Table:
     def vector(self, key: str, *, sizes: tuple[int, ...] = (3,), low: float = -LARGEST, high: float = LARGEST) -> Any:
         """Return a list of numbers from ``low`` to ``high`` whose length is one of ``sizes``.
 
-        Errors are those of ``number``.
+        A missing key or another value is an error.
         """
         return self._take(key, "vector", None, sizes=sizes, low=low, high=high)

@@ -99,7 +99,7 @@ class TexturePack:
             use: Texture of a mesh's file.
             images: Pictures of that file.
             encoded: True if RGB is sRGB-encoded.
-            cutoff: As in ``mip_levels``.
+            cutoff: Alpha cutoff of a mask; None: alpha is no mask.
             path: Picture of the scene, used in place of the file's or multiplied with it.
             clamp: True if the scene's picture is clamped at its border instead of repeated.
         """
