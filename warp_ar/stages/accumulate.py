@@ -35,7 +35,7 @@ class Accumulate(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with a mirror ball."""
+        """Return the resources read and written for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         seen = "merged" if features.merged else "probe"
@@ -47,7 +47,7 @@ class Accumulate(Stage):
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the accumulated maps, and the change of each sector (block of texels)."""
+        """Declare the arrays of the accumulated maps, and the change of each sector (block of texels)."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         others = self.features.others

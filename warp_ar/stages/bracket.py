@@ -27,7 +27,7 @@ class Bracket(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a mirror ball and a source whose frames alternate between exposures."""
+        """Return the resources read and written for a mirror ball, and frames that alternate between exposures."""
         if not features.observed:
             return LeftOut(unobserved(features))
         if len(features.request.exposures) < 2:
@@ -39,7 +39,7 @@ class Bracket(Stage):
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the arrays of all exposures' maps, of the clipped share near each texel, and of the merged map."""
+        """Declare the arrays of all exposures' maps, of the clipped share near each texel, and of the merged map."""
         height = self.request.quality.environment_height
         count = len(self.request.exposures)
         types = dict(zip(UNWRAPPED, (wp.vec3, wp.float32, wp.vec3), strict=True))

@@ -34,13 +34,13 @@ class Captured(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene that names a light file."""
+        """Return the resources read and written for a scene that names a light file."""
         if features.request.scene.captured is None:
             return LeftOut("the scene names no captured light")
         return Wiring(("captured_light",), ("environment", "emitters") if features.emitters else ("environment",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the map, and its emitters if their positions are given."""
+        """Declare the arrays of the environment map, and of its emitters if their positions are given."""
         height = self.request.quality.environment_height
         specs = {"environment": ArraySpec((height, 2 * height), wp.vec3)}
         if self.features.emitters:

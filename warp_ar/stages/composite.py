@@ -27,7 +27,7 @@ class Composite(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring; left out if nothing is laid over the frame, or if ``expose`` composes the picture."""
+        """Return the resources read and written; none if no layer covers the frame, or if ``expose`` composes it."""
         layers = features.layers
         if features.exposed:
             return LeftOut("the exposure stage composes what it exposes")
@@ -36,7 +36,7 @@ class Composite(Stage):
         return Wiring(("frame", *layers), ("image",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the picture."""
+        """Declare the array of the picture."""
         return {"image": ArraySpec(self.shape, wp.vec3ub)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:

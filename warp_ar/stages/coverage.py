@@ -25,11 +25,11 @@ class Coverage(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring; the graph leaves the stage out if coverage is not requested."""
+        """Return the resources read and written; the graph leaves the stage out if coverage is not requested."""
         return Wiring(("pose", "objects", "surface_ids"), ("coverage",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the array of up to four surfaces with their shares per pixel."""
+        """Declare the array of up to four surfaces with their shares per pixel."""
         return {"coverage": ArraySpec(self.shape, vec8)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:

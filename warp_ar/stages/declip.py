@@ -28,12 +28,12 @@ class Declip(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring, with the ball's light if the exposure's method uses it."""
+        """Return the resources read and written, with the ball's light if the exposure's method uses it."""
         reads = ("frame", "pose", "environment") if features.declipped_by_ball else ("frame",)
         return Wiring(reads, ("declipped",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the frame's radiance near clipped pixels, the tiles that contain them, and a pyramid of hues."""
+        """Declare the arrays of the frame's radiance near clipped pixels, of tiles with such pixels, and of hues."""
         tiles = ArraySpec(declip.tile_shape(*self.shape), wp.int32)
         return {
             "declipped": ArraySpec(self.shape, wp.vec3),

@@ -33,7 +33,7 @@ class EnvironmentSamples(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring: reads the environment, writes samples."""
+        """Return the resources that the stage reads, such as the environment, and the samples that it writes."""
         if not features.environment:
             return LeftOut(NO_BALL)
         emitters = ("emitters",) if features.emitters else ()
@@ -42,7 +42,7 @@ class EnvironmentSamples(Stage):
         return Wiring(("environment", *emitters, *others, *placed), ("environment_samples",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the samples, and the cumulative sums that are inverted to draw them; for the reference also texels."""
+        """Declare the arrays of the samples, of the sums by which they are drawn, and for the reference of texels."""
         height = self.request.quality.environment_height
         count = sample_count(self.features)
         specs = {

@@ -74,7 +74,7 @@ class EnvironmentShadow(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with light, objects that cast shadows, and a receiver."""
+        """Return the resources read and written for a scene with light, objects that cast shadows, and a receiver."""
         scene, quality = features.request.scene, features.request.quality
         if not scene.objects:
             return LeftOut(base.NO_OBJECT)
@@ -92,11 +92,11 @@ class EnvironmentShadow(Stage):
         return Wiring(tuple(reads), ("shadow_ratio",))
 
     def idle(self, reach: Reach) -> str | None:
-        """Return a reason if no virtual object shades anything in the picture."""
+        """Return the reason for no effect in a frame if no virtual object shades anything in the picture, else None."""
         return None if reach.shadows else "no virtual object is near anything in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the arrays of the shadow ratio, and of the cells' estimates that are averaged to it."""
+        """Declare the arrays of the shadow ratio, and of the cells' estimates that are averaged to it."""
         cells = shadow_cells(self.features)
         return {
             "shadow_ratio": ArraySpec(self.shape, wp.vec3, wp.vec3(1.0, 1.0, 1.0)),

@@ -32,7 +32,7 @@ class Expose(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring: the layers, and the resources from which the method estimates clipped pixels."""
+        """Return the resources read and written, among them those from which the method estimates clipped pixels."""
         scale = features.request.scene.exposure.scale
         if not features.exposed:
             return LeftOut("exposure is 1" if scale == 1.0 else "exposure is auto and no virtual light falls")
@@ -45,7 +45,7 @@ class Expose(Stage):
         return Wiring(tuple(reads), ("image",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the picture, the scale and the table of codes; for ``auto`` also the histogram."""
+        """Declare the arrays of the picture, the scale and the table of codes; for ``auto`` also the histogram."""
         specs = {
             "image": ArraySpec(self.shape, wp.vec3ub),
             "expose_scale": ArraySpec((1,), wp.float32),

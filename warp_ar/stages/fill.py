@@ -33,7 +33,7 @@ class Fill(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with a mirror ball."""
+        """Return the resources read and written for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         written = "filled_radiance" if features.recovered else "environment"
@@ -43,7 +43,7 @@ class Fill(Stage):
         return Wiring(reads, (written, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the map and the fill pyramid."""
+        """Declare the arrays of the completed environment map and of the fill pyramid."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         return {

@@ -40,7 +40,7 @@ class Gloss(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring, with the resources that light the objects and the layers that a receiver reflects."""
+        """Return the resources read and written, among them objects' light and the layers that receivers reflect."""
         if not features.request.scene.has_gloss:
             return LeftOut("no proxy has a material: the receiver is matt")
         if not features.environment:
@@ -53,11 +53,11 @@ class Gloss(Stage):
         return Wiring(tuple(sorted(reads)), ("reflected",))
 
     def idle(self, reach: Reach) -> str | None:
-        """Return a reason if no receiver with a material is in the picture; reflected content may lie outside it."""
+        """Return the reason for no effect in a frame if no glossy receiver is in the picture, else None."""
         return None if reach.balls else "no receiver with a material is in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the change of radiance before and after averaging, and the reflection parameters of proxies."""
+        """Declare the arrays of the change of radiance before and after averaging, and of the proxies' reflection."""
         return {
             "reflected": ArraySpec(self.shape, wp.vec3),
             "gloss_change": ArraySpec(self.shape, wp.vec3),

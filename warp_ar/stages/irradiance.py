@@ -44,7 +44,7 @@ class Irradiance(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring: reads the environment, writes irradiance in the method's form."""
+        """Return the resources read and written: the environment, and irradiance in the method's form."""
         if not features.environment:
             return LeftOut(NO_BALL)
         by_texture = cls.method_for(features) == "sphere_mip"
@@ -54,7 +54,7 @@ class Irradiance(Stage):
         return Wiring(reads, (features.irradiance,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return irradiance and its partial sums."""
+        """Declare the arrays of irradiance and its partial sums."""
         specs, others = self._first(), self.features.others_with_irradiance
         if others:
             form = specs[self.features.irradiance]

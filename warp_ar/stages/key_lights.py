@@ -24,13 +24,13 @@ class KeyLights(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with a mirror ball."""
+        """Return the resources read and written for a scene with a mirror ball."""
         if not features.environment:
             return LeftOut(NO_BALL)
         return Wiring(("environment",), ("key_lights",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the light and its partial sums."""
+        """Declare the arrays of the dominant direction and of its partial sums."""
         return {
             "key_lights": ArraySpec((1,), KeyLight),
             "key_lights_sums": ArraySpec((self.request.quality.environment_height,), wp.vec4),

@@ -98,7 +98,7 @@ class MirrorBall(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring, with the resources that light the objects and the receiver."""
+        """Return the resources read and written, with the resources that light the objects and the receiver."""
         quality = features.request.quality
         if not features.request.scene.probes:
             return LeftOut("the scene has no mirror ball")
@@ -123,7 +123,7 @@ class MirrorBall(Stage):
         return tuple(name for name in self.wiring.reads if name in unlit)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the change of radiance."""
+        """Declare the array of the change of each pixel's radiance."""
         return {"mirror_ball": ArraySpec(self.shape, wp.vec3)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:

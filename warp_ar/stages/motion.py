@@ -28,11 +28,11 @@ class Motion(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring; the stage reads the clock, so it runs in every frame if motion is requested."""
+        """Return the resources read and written; the clock among them makes the stage run in every frame."""
         return Wiring(("pose", "objects", "clock", "surface_ids", "position"), ("motion",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the motion, and the previous frame's camera and objects."""
+        """Declare the arrays of the motion, and the previous frame's camera and objects."""
         count = max(1, len(object_shapes(self.request.scene)))
         return {
             "motion": ArraySpec(self.shape, wp.vec2),

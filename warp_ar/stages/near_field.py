@@ -96,7 +96,7 @@ class NearField(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with objects and an environment that lights them."""
+        """Return the resources read and written for a scene with objects and an environment that lights them."""
         if not features.request.scene.objects:
             return LeftOut(base.NO_OBJECT)
         if not features.environment:
@@ -109,11 +109,11 @@ class NearField(Stage):
         return Wiring(tuple(reads), features.near_names)
 
     def idle(self, reach: Reach) -> str | None:
-        """Return a reason if no object is in the picture."""
+        """Return the reason for no effect in a frame if no object is in the picture, else None."""
         return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return irradiance and reflected radiance, before and after averaging."""
+        """Declare the arrays of irradiance and reflected radiance, before and after averaging."""
         config = self.features.distant
         specs = {}
         if config.diffuse != "none":

@@ -64,7 +64,7 @@ class Prefilter(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring: reads the environment, writes the levels."""
+        """Return the resources read and written: the environment, and its filtered levels."""
         if not features.environment:
             return LeftOut(NO_BALL)
         by_texture = cls.method_for(features) == "sphere_mip"
@@ -86,7 +86,7 @@ class Prefilter(Stage):
         return mirrors and not self.features.shadowed
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the levels, and the pyramid from which they are filtered."""
+        """Declare the arrays of the levels, and the pyramid from which they are filtered."""
         height = self.request.quality.environment_height
         specs = {"prefilter_levels": ArraySpec((lobe_texels(height),), wp.vec3)}
         if others := self._others(self.features):

@@ -114,7 +114,7 @@ class Recover(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with a mirror ball and a method other than ``clipped``."""
+        """Return the resources read and written for a scene with a mirror ball and a method other than ``clipped``."""
         if not features.observed:
             return LeftOut(unobserved(features))
         if not features.recovered:
@@ -129,7 +129,7 @@ class Recover(Stage):
         return Wiring((*reads, "others_filled", *kept, "probe_places"), (*writes, *others))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the arrays of the environment map with recovered light, and of the equations for that light."""
+        """Declare the arrays of the environment map with recovered light, and of the equations for that light."""
         height, others = self.request.quality.environment_height, self.features.others
         shape, most = (height, 2 * height), (CONFIG.search.most,)
         cells = cell_shape(*shape)

@@ -76,7 +76,7 @@ class Relight(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring, with the resources of the environment and the receiver that the method uses."""
+        """Return the resources read and written, among them those of environment and receiver that the method uses."""
         if not sheds_light(features.request.scene):
             return LeftOut("the scene has no virtual light")
         if not features.lit:
@@ -88,13 +88,13 @@ class Relight(Stage):
         return () if self.features.near_field else ("environment_shadow",)
 
     def idle(self, reach: Reach) -> str | None:
-        """Return a reason if no light has power, or none falls on the receiver in the picture."""
+        """Return the reason for no effect if no light has power or reaches the receiver in the picture, else None."""
         if not reach.shines:
             return "no virtual light has any power"
         return None if reach.light else "virtual light falls on nothing in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the added radiance, and the cells from which it is computed."""
+        """Declare the arrays of the added radiance, and the cells from which it is computed."""
         specs = {"added_light": ArraySpec(self.shape, wp.vec3)}
         if self.request.quality.edge_samples > 1:
             specs["relight_visibility"] = ArraySpec(self.shape, wp.int32)

@@ -35,7 +35,7 @@ class Separate(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring, with only the resources of the requested layers."""
+        """Return the resources read and written, with only the resources of the requested layers."""
         asked = [name for name in PICTURE_LAYERS if features.request.asks_for(LAYERS[name].resource)]
         if not asked:
             return LeftOut(NOT_ASKED)
@@ -51,7 +51,7 @@ class Separate(Stage):
         return Wiring(tuple(reads), tuple(LAYERS[name].resource for name in asked))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the requested layers."""
+        """Declare the arrays of the requested layers."""
         return {
             name: ArraySpec(self.shape, wp.vec4 if name == LAYERS["objects"].resource else wp.vec3)
             for name in self.wiring.writes

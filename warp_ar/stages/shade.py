@@ -42,7 +42,7 @@ class Shade(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring, with only the forms of light that the scene's materials reflect."""
+        """Return the resources read and written, with only the forms of light that the scene's materials reflect."""
         if not features.request.scene.objects:
             return LeftOut(base.NO_OBJECT)
         config = shade_config(features)
@@ -55,11 +55,11 @@ class Shade(Stage):
         return Wiring(tuple(reads), ("virtual",))
 
     def idle(self, reach: Reach) -> str | None:
-        """Return a reason if no object is in the picture."""
+        """Return the reason for no effect in a frame if no object is in the picture, else None."""
         return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the shaded objects and the edge lists."""
+        """Declare the arrays of the shaded objects and the edge lists."""
         return {
             "virtual": ArraySpec(self.shape, wp.vec4),
             **edge_arrays(self.request, self.name),

@@ -27,13 +27,13 @@ class SphereMap(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with a mirror ball."""
+        """Return the resources read and written for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         return Wiring((*frame_reads(features), "pose"), ("sphere_map",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return all levels in one array."""
+        """Declare the array that holds all mip levels."""
         return {"sphere_map": ArraySpec((sphere_map.map_texels(),), wp.vec3)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:

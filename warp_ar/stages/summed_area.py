@@ -23,13 +23,13 @@ class SummedArea(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring; deeper frames have a second table, of the residual below 8 bits."""
+        """Return the resources read and written; deeper frames have a second table, of the residual below 8 bits."""
         if SUMMED_CUT in box_reads(features):
             return Wiring(frame_reads(features), (SUMMED, SUMMED_CUT))
         return Wiring(("frame",), (SUMMED,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the table; with two tables also the frame of residuals."""
+        """Declare the array of the table; for deeper frames also those of the residual and of its table."""
         specs = {name: ArraySpec(self.shape, wp.uint32) for name in self.wiring.writes}
         if SUMMED_CUT in specs:
             specs["summed_area_cut_frame"] = ArraySpec(self.shape, wp.vec3ub)

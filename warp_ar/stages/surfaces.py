@@ -30,12 +30,12 @@ class Surfaces(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring; the graph leaves the stage out if none of its outputs is requested."""
+        """Return the resources read and written; the graph leaves the stage out if none of its outputs is requested."""
         hits = ("hit_object", "hits") if features.request.scene.objects else ()
         return Wiring(("pose", "objects", *hits), ("surface_ids", "depth", "normals", "position"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return one surface per pixel."""
+        """Declare the arrays of index, depth, normal and position of one surface per pixel."""
         return {
             "surface_ids": ArraySpec(self.shape, wp.int32, -1),
             "depth": ArraySpec(self.shape, wp.float32),

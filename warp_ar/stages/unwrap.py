@@ -47,7 +47,7 @@ class Unwrap(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with a mirror ball."""
+        """Return the resources read and written for a scene with a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
         by_texture = cls.method_for(features) == "sphere_map"
@@ -58,7 +58,7 @@ class Unwrap(Stage):
         return Wiring((*frames, "pose", *texture), (*written, *other_names(features, OTHERS), *seen))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return the map, and the image positions of its texels' corners."""
+        """Declare the arrays of the latlong map, and of the image positions of its texels' corners."""
         height = self.request.quality.environment_height
         width = 2 * height
         specs = {

@@ -28,17 +28,17 @@ class Visibility(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Return the wiring for a scene with virtual objects."""
+        """Return the resources read and written for a scene with virtual objects."""
         if not features.request.scene.objects:
             return LeftOut(base.NO_OBJECT)
         return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
     def idle(self, reach: Reach) -> str | None:
-        """Return a reason if no object is in the picture."""
+        """Return the reason for no effect in a frame if no object is in the picture, else None."""
         return None if reach.objects else base.OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Return one hit per pixel."""
+        """Declare the arrays of the visible object and the hit of each pixel."""
         return {"hit_object": ArraySpec(self.shape, wp.int32, -1), "hits": ArraySpec(self.shape, Hit, Hit())}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
