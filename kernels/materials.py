@@ -238,7 +238,7 @@ def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.f
     """Return the share of the environment's light in the lobe that reaches a point [LdR14].
 
     ``occlusion`` is the share of the environment's irradiance that reaches the point. The result is 1 where nothing is
-    hidden, and for a mirror that is viewed along its normal.
+    hidden. It is about ``occlusion`` for a rough lobe, and larger for a mirror that is viewed along its normal.
     """
     power = wp.pow(2.0, -16.0 * roughness - 1.0)
     return wp.clamp(wp.pow(wp.max(cos_o + occlusion, 0.0), power) - 1.0 + occlusion, 0.0, 1.0)
