@@ -44,11 +44,6 @@ def light_kind(light: scenes.Light) -> int:
     return int(_LIGHTS[light.kind])
 
 
-def has_sized_lights(scene: scenes.Scene) -> bool:
-    """Return True if any virtual light has a radius and thus a soft shadow."""
-    return any(light.radius > 0.0 for light in scene.lights)
-
-
 def trace_config(scene: scenes.Scene) -> TraceConfig:
     """Return the kinds of shapes that rays can meet in ``scene``, and if hits need per-triangle data."""
     made_of = [materials_of(item) for item in scene.objects]

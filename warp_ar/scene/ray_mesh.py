@@ -115,7 +115,7 @@ def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
 
 def mesh_key(item: ObjectShape | scenes.Object | scenes.Proxy) -> Any:
-    """Return the cache key of a mesh: file, part, or a torus's radii and tolerance.
+    """Return the cache key of a mesh: file, part, or a function that makes it and its arguments.
 
     Return None for shapes that rays intersect analytically.
     """
@@ -127,34 +127,29 @@ def mesh_key(item: ObjectShape | scenes.Object | scenes.Proxy) -> Any:
         if not isinstance(item, scenes.Object):
             return item.file
         source = item.file if item.mesh is None else item.mesh
-        return source if item.stretch is None else ("stretched", source, item.stretch)
+        return source if item.stretch is None else (_stretched, source, item.stretch)
     if not isinstance(item, scenes.Object):
         return None
     if item.shape == "torus":
         outer = item.scale * (item.major_radius + item.minor_radius)
-        return item.major_radius, item.minor_radius, silhouette_tolerance(outer) / item.scale
+        return torus_mesh, item.major_radius, item.minor_radius, silhouette_tolerance(outer) / item.scale
     gap = silhouette_tolerance(item.scale * max(item.radius, 0.5 * item.length)) / item.scale
     emissive = isinstance(item.material, scenes.EmissiveMaterial)
     match item.shape:
         case "rect":
             pictured = emissive and item.material.image is not None  # type: ignore[union-attr]
-            return "rect", item.size[:2], PICTURE_CELLS if pictured else 1
+            return rect_mesh, item.size[:2], PICTURE_CELLS if pictured else 1
         case "disk":
-            return "disk", item.radius, gap
+            return disk_mesh, item.radius, gap
         case "tube":
-            return "tube", item.radius, item.length, gap
+            return tube_mesh, item.radius, item.length, gap
         case "box" if emissive:
-            return "box", item.size
+            return box_mesh, item.size
     return None
 
 
-_MAKERS: Final[dict[str, Any]] = {
-    "rect": rect_mesh,
-    "disk": disk_mesh,
-    "tube": tube_mesh,
-    "box": box_mesh,
-    "stretched": lambda source, stretch: stretched_mesh(make_mesh(source), stretch),
-}
+def _stretched(source: Path | Mesh, stretch: tuple[float, ...]) -> Mesh:
+    return stretched_mesh(make_mesh(source), stretch)
 
 
 def make_mesh(key: Any) -> Mesh:
@@ -165,7 +160,8 @@ def make_mesh(key: Any) -> Mesh:
         return file_mesh(key)
     if isinstance(key[-1], Mesh):
         return key[-1]
-    return _MAKERS[key[0]](*key[1:]) if key[0] in _MAKERS else torus_mesh(*key)
+    made: Mesh = key[0](*key[1:])
+    return made
 
 
 def texture_density(mesh: Mesh) -> npt.NDArray[np.float32]:

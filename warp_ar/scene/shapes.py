@@ -158,14 +158,12 @@ def tube_mesh(radius: float, length: float, tolerance: float | None = None) -> M
         The mesh; u runs around the axis from +x through +y, v along it.
     """
     count = _segments(radius, silhouette_tolerance(radius) if tolerance is None else tolerance)
-    turn, side = np.meshgrid(np.arange(count + 1), np.arange(2), indexing="ij")
-    phi = 2.0 * np.pi * (turn % count) / count
-    normals = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1).reshape(-1, 3)
+    u, v, faces = _grid(count, 1)
+    phi = 2.0 * np.pi * (u % 1.0)
+    normals = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1)
     vertices = radius * normals
-    vertices[:, 2] = length * (side.ravel() - 0.5)
-    a = 2 * np.arange(count)
-    faces = np.stack([a, a + 2, a + 3, a, a + 3, a + 1], axis=-1).reshape(-1, 3)
-    return make_mesh(vertices, faces, normals, np.stack([turn.ravel() / count, side.ravel()], axis=-1))
+    vertices[:, 2] = length * (v - 0.5)
+    return make_mesh(vertices, faces, normals, np.stack([u, v], axis=-1))
 
 
 def _grid(columns: int, rows: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:

@@ -16,7 +16,7 @@ from warp_ar.kernels.picture.expose import BOXES
 from warp_ar.kernels.rays.area_lights import POINT_SAMPLES
 from warp_ar.scene import Scene
 from warp_ar.scene.area_lights import emits_light
-from warp_ar.scene.kinds import has_sized_lights, material_model, proxies_face, trace_config
+from warp_ar.scene.kinds import material_model, proxies_face, trace_config
 from warp_ar.scene.object_materials import (
     is_detailed,
     materials_of,
@@ -191,7 +191,7 @@ def find_features(request: Request) -> Features:
         relight_method=relight_method,
         ambient_visibility=lit_by_both and hidden and relight_method in MEASURED,
         bounced=relight_method in LOCAL and proxies_face(scene),
-        soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
+        soft_lights=quality.method("light_shadow") == "soft" and any(light.radius > 0.0 for light in scene.lights),
         area_samples=area_samples,
         area_cells=area_samples > 0 and area_method(quality) in AREA_CELLS and relight_method in (FLAT, *MEASURED),
         others=others,
