@@ -42,7 +42,7 @@ from warp_ar.kernels.reference.path_picture import (
 from warp_ar.kernels.reference.path_sampling import make_sky
 from warp_ar.kernels.reference.path_vertices import LocalScene
 from warp_ar.kernels.split_sum import integrate_dfg
-from warp_ar.light.captured import Light
+from warp_ar.light.captured import Light, placed_emitters
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.pixel_rays import pixel_rays
@@ -219,9 +219,10 @@ class PathTracer:
         """Number of passes since samples were last distributed among pixels."""
         self._linear = None if frame is None else _linear_frame(frame, self.camera)
         self._config = trace_variant(trace_config(scene), self.device)
+        near = placed_emitters(light.emitters if isinstance(light, Light) else ())
         with translating(self.device), wp.ScopedDevice(self.device):
             self._host = HostScene(self.scene, self.device)
-            self._local = self._make_local(_environment(light), _near_emitters(light), seconds)
+            self._local = self._make_local(_environment(light), near, seconds)
             self._params = wp.array(self._camera_values(pose), dtype=structs.FrameParams, device=self.device)
             self._set_reflectances(reflectances)
             self._allocate()
@@ -543,16 +544,6 @@ def _environment(light: Light | FloatImage) -> FloatImage:
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape[:2]) < 2:
         raise UsageError(f"light has the shape {radiance.shape}: expected latlong radiance (h, 2 h, 3)")
     return radiance
-
-
-def _near_emitters(light: Light | FloatImage) -> npt.NDArray[Any]:
-    """Return records of the emitters with known distances."""
-    near = [e for e in light.emitters if e.distance is not None] if isinstance(light, Light) else []
-    records = np.zeros(len(near), structs.struct_dtype(structs.Emitter))
-    for record, emitter in zip(records, near, strict=True):
-        record["origin"], record["direction"] = emitter.origin, emitter.direction
-        record["distance"], record["power"] = emitter.distance, emitter.power
-    return records
 
 
 def _linear_frame(frame: Image | FloatImage, camera: Any) -> FloatImage:

@@ -34,6 +34,7 @@ from warp_ar.declared import check_fields, checked
 from warp_ar.errors import SceneError, SinkError, UsageError, reason
 from warp_ar.exr_file import read_exr_header, read_linear_picture, write_exr
 from warp_ar.files import parse_json, write_whole
+from warp_ar.kernels.structs import Emitter, struct_dtype
 from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, to_axes, world_from_marker
 from warp_ar.signals import REC_709
 
@@ -286,15 +287,8 @@ def find_emitters(
         toward = (directions[inside] * light.mean(1)[:, None]).sum(0)
         toward /= max(float(np.linalg.norm(toward)), 1e-12)
         clips = clipped[inside].max() > 0.0
-        found.append(
-            CapturedEmitter(
-                _triple(toward),
-                float(area[inside].sum()),
-                _triple(power),
-                _triple(least * (1 - error)),
-                None if clips else _triple(power * (1 + error)),
-            )
-        )
+        low, high = _triple(least * (1 - error)), None if clips else _triple(power * (1 + error))
+        found.append(CapturedEmitter(_triple(toward), float(area[inside].sum()), _triple(power), low, high))
     return tuple(sorted(found, key=lambda emitter: -sum(emitter.power))[:MOST_EMITTERS])
 
 
@@ -328,25 +322,23 @@ def has_places(path: str | Path) -> bool:
         return False  # the error is reported when the light is read
 
 
-def placed_emitters(light: Light, scale: float, rotation: Array, most: int) -> list[dict[str, Any]]:
-    """Return the fields of ``kernels.structs.Emitter`` for each emitter of known distance.
+def placed_emitters(
+    emitters: Sequence[CapturedEmitter], scale: float = 1.0, rotation: Array | None = None
+) -> NDArray[Any]:
+    """Return records of ``kernels.structs.Emitter`` for the emitters of known distance.
 
     Args:
-        light: Light as it was read.
-        scale: Factor from the light's values to camera values of the frames.
-        rotation: Rotation from the light's axes to the scene's, (3, 3).
-        most: Largest number of emitters; the most powerful are kept.
+        emitters: Emitters of a light.
+        scale: Factor to the camera values of the frames.
+        rotation: Rotation from the light's axes to the scene's, (3, 3); None: the axes are the same.
     """
-    return [
-        {
-            "origin": rotation @ np.array(emitter.origin),
-            "direction": rotation @ np.array(emitter.direction),
-            "distance": emitter.distance,
-            "power": scale * np.array(emitter.power),
-        }
-        for emitter in light.emitters
-        if emitter.distance is not None
-    ][:most]
+    turn = np.eye(3) if rotation is None else rotation
+    placed = [emitter for emitter in emitters if emitter.distance is not None]
+    records = np.zeros(len(placed), struct_dtype(Emitter))
+    for record, emitter in zip(records, placed, strict=True):
+        record["origin"], record["direction"] = turn @ np.array(emitter.origin), turn @ np.array(emitter.direction)
+        record["distance"], record["power"] = emitter.distance, scale * np.array(emitter.power)
+    return records
 
 
 def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:

@@ -41,8 +41,7 @@ class Captured(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the environment map, and of its emitters if their positions are given."""
-        height = self.request.quality.environment_height
-        specs = {"environment": ArraySpec((height, 2 * height), wp.vec3)}
+        specs = {"environment": ArraySpec(self.map_shape, wp.vec3)}
         if self.features.emitters:
             specs["emitters"] = ArraySpec((CONFIG.search.most,), Emitter)
         return specs
@@ -55,14 +54,11 @@ class Captured(Stage):
         if spec.colors is not None:
             light = light.recolored(np.reshape(spec.colors, (3, 3)))
         turn = rotation_matrix(spec.rotate)
-        self._radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
+        self._radiance = spec.scale * light.resampled(self.map_height, turn)
 
         self._emitters = np.zeros(CONFIG.search.most, struct_dtype(Emitter))
-        placed = placed_emitters(light, spec.scale, turn, CONFIG.search.most)
-        for record, fields in zip(self._emitters, placed, strict=False):
-            for name, value in fields.items():
-                record[name] = value
-
+        placed = placed_emitters(light.emitters, spec.scale, turn)[: CONFIG.search.most]
+        self._emitters[: len(placed)] = placed
         copies = HostCopies({name: arrays[name] for name in self.arrays()}, device)
 
         def copy(rows: Rows | None) -> None:
