@@ -51,22 +51,15 @@ def connected_regions(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """
     height = len(mask)
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    parent = list(range(count))
-
-    def root(label: int) -> int:
-        while parent[label] != label:
-            label = parent[label]
-        return label
-
+    roots = np.arange(count)
     for row in range(height):
         for other in range(max(row - 1, 0), min(row + 2, height)):
             if labels[row, -1] and labels[other, 0]:
-                parent[root(int(labels[row, -1]))] = root(int(labels[other, 0]))
+                roots[roots == roots[labels[row, -1]]] = roots[labels[other, 0]]
     for row in (0, height - 1):
-        at_pole = [int(label) for label in np.unique(labels[row]) if label]
+        at_pole = np.unique(labels[row][labels[row] > 0])
         for label in at_pole[1:]:
-            parent[root(label)] = root(at_pole[0])
-    roots = np.array([root(label) for label in range(count)])
+            roots[roots == roots[label]] = roots[at_pole[0]]
     number = np.full(count, -1)
     number[np.unique(roots[1:])] = np.arange(len(np.unique(roots[1:])))
     return np.asarray(number[roots][labels], np.int64)
