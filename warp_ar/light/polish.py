@@ -300,11 +300,8 @@ def _explain(seen: _Seen, environment: NDArray[np.float32], turn: Array, roughne
 def _solve(seen: _Seen, terms: list[Array]) -> _Fit:
     """Return the robust least-squares fit of terms, (k, n, 3), and of exposures to the differences between views."""
     mean, trust = seen.mean, np.ones_like(seen.radiance)
-    drifts = []
-    for view in range(1, len(seen.radiance)):
-        drift = np.zeros_like(seen.radiance)
-        drift[view] = mean
-        drifts.append(drift)
+    views = np.arange(len(seen.radiance))[:, None, None]
+    drifts = [mean * (views == view) for view in range(1, len(views))]
     for _ in range(ROUNDS):
         weight = trust * seen.tells[..., None] / mean**2
         total = np.maximum(weight.sum(0), 1e-12)
