@@ -76,8 +76,6 @@ def covered_card(points: Array, kind: NDArray[np.int64], light: Array) -> NDArra
     config = CONFIG.card
     paper, ink = np.flatnonzero(kind == Kind.CARD), np.flatnonzero(kind == Kind.INK)
     covered = np.zeros(len(kind), bool)
-    if min(len(paper), len(ink)) < config.least_cells:
-        return covered
     value = light.mean(axis=1)
     apart = np.linalg.norm(points[ink][:, None] - points[paper], axis=2)
     of_ink = value[paper[np.argsort(apart, axis=1, kind="stable")[:, :3]]]
