@@ -140,9 +140,8 @@ class EmitterSearch:
             if better[0] == candidate:
                 break
             candidate, cost = better
-        if self.problem.trace is not None:
-            others = [Candidate(candidate.cell, distance) for distance in (np.inf, *CONFIG.search.distances)]
-            candidate, cost = self._best_of(others, candidate, cost, fits, least)
+        others = [Candidate(candidate.cell, distance) for distance in (np.inf, *CONFIG.search.distances)]
+        candidate, cost = self._best_of(others, candidate, cost, fits, least)
         # A difference of the cost below one standard deviation does not determine the distance.
         return self._at_its_distance(candidate, cost, fits, max(least, CONFIG.search.worth_moving))
 
@@ -163,7 +162,7 @@ class EmitterSearch:
         while they decrease the cost by more than ``least``; the result is the minimum of a parabola through the last
         three distances.
         """
-        if self.problem.trace is None or not np.isfinite(candidate.distance):
+        if not np.isfinite(candidate.distance):
             return candidate
 
         def place(step: float) -> Candidate:
@@ -223,8 +222,8 @@ class EmitterSearch:
             return
         step = -(-len(cells) // places)
         cells = cells[turn % step :: step]
-        distances = [np.inf, *CONFIG.search.distances] if self.problem.trace is not None else [np.inf]
-        candidates = [Candidate(int(cell), float(distance)) for distance in distances for cell in cells]
+        distances = np.inf, *CONFIG.search.distances
+        candidates = [Candidate(int(cell), distance) for distance in distances for cell in cells]
         columns = self.problem.power_columns(candidates)
         fits = self.fit_anew()
         for _ in range(most):

@@ -85,7 +85,7 @@ class Problem:
         observations: NDArray[Any],
         surfaces: Surfaces,
         white: float,
-        trace: Trace | None,
+        trace: Trace,
         aim: Array,
         origin: Array,
     ) -> None:
@@ -98,7 +98,7 @@ class Problem:
             observations: Records of ``Observation``, (n,).
             surfaces: Surface points.
             white: Reflectance of the card's paper.
-            trace: Function that traces emitters at finite distances; None: all light is distant.
+            trace: Function that traces emitters at finite distances.
             aim: Directions from ``emitter_directions``, (rows * columns, 3).
             origin: Points from ``mirroring_points`` for these directions, (rows * columns, 3).
         """
@@ -310,7 +310,7 @@ class Problem:
         distances = np.array([candidate.distance for candidate in candidates])
         columns: Array = np.asarray(self.transfer[:, cells] / self.solid_angle[cells], np.float64)
         near = [k for k, candidate in enumerate(candidates) if np.isfinite(candidate.distance)]
-        if self.trace is not None and near:
+        if near:
             new = [k for k in near if candidates[k] not in self._traced]
             if new:
                 at = self.origin[cells[new]] + distances[new, None] * self.aim[cells[new]]

@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +57,6 @@ from warp_ar.light.problem import Candidate, Problem, Trace, emitter_directions,
 from warp_ar.light.surfaces import Surfaces
 
 Array = NDArray[np.float64]
-
-METHODS: Final = ("clipped", "white_card", "shading")
 """Methods: clipped light as captured, raised by the card alone, or by the shading of all surfaces."""
 
 
@@ -76,12 +74,7 @@ class Recovery:
             center: Centre of the ball, metres.
             radius: Radius of the ball, metres: emitters are seen from its surface. 0: from its centre.
             method: ``white_card`` or ``shading``.
-
-        Raises:
-            ValueError: The method is unknown.
         """
-        if method not in METHODS[1:]:
-            raise ValueError(f"recover: no method {method!r} to estimate; expected {' or '.join(METHODS[1:])}")
         self.surfaces, self.method = surfaces, method
         self._white, self._center, self._radius = white, np.array(center, float), radius
         self._candidates: list[Candidate] = []
@@ -109,7 +102,7 @@ class Recovery:
         transfer: NDArray[Any],
         mirrored: NDArray[Any],
         observations: NDArray[Any],
-        trace: Trace | None = None,
+        trace: Trace,
         camera: Array | None = None,
     ) -> Estimate:
         """Return the estimate from one frame, averaged with former ones while the light is unchanged.
@@ -119,7 +112,7 @@ class Recovery:
             transfer: Direct transfer from ``trace_transfer``, (n, rows * columns).
             mirrored: Transfer by reflection in balls from ``trace_transfer``, (n, rows * columns).
             observations: Records of ``Observation``, (n,).
-            trace: Function that traces emitters at finite distances; None: all light is distant.
+            trace: Function that traces emitters at finite distances.
             camera: Position of the camera, metres, (3,); None: emitters are seen from the ball's centre.
         """
         with one_blas_thread():
@@ -143,8 +136,8 @@ class Recovery:
         self._solved += 1
         self._unseen = 0
         problem.leave_out(covered_card(problem.points, problem.kind, problem.light))
-        means, bounds, radiance_by_card = _by_card(problem)
-        by_card = problem.member @ radiance_by_card
+        means, bounds = problem.card_means()
+        by_card = problem.member @ (problem.expected[problem.component][:, None] * means)
         if self.method == "white_card" or not (problem.parts or problem.may_hold_candidate.any()):
             factor = problem.card_factor(bounds, doubt_of(card.contrast))
             self._held = self._estimate(problem, by_card, bounds, "white_card", factor, card)
@@ -153,7 +146,7 @@ class Recovery:
         best = choose_channel(problem)
         self._search(problem, means)
         problem.share_by_depth()
-        means, bounds, _ = _by_card(problem)
+        means, bounds = problem.card_means()
         means = np.maximum(means, 0.05)
         solution = _solve_channels(problem, best, means, bounds)
         recovered, powers = problem.member @ solution[: problem.parts], solution[problem.parts :]
@@ -163,16 +156,9 @@ class Recovery:
         ]
         emitters = []
         for candidate, power in zip(problem.candidates, powers, strict=True):
-            recovered += problem.patch(candidate.cell) * power
-            emitters.append(
-                FoundEmitter(
-                    problem.origin[candidate.cell],
-                    problem.aim[candidate.cell],
-                    candidate.distance,
-                    power,
-                    candidate.cell,
-                )
-            )
+            cell = candidate.cell
+            recovered += problem.patch(cell) * power
+            emitters.append(FoundEmitter(problem.origin[cell], problem.aim[cell], candidate.distance, power, cell))
         emitters.sort(key=lambda emitter: -float(emitter.power.sum()))
         factor = min(
             most_by_card(problem, recovered, bounds, doubt_of(card.contrast)),
@@ -244,12 +230,6 @@ class Recovery:
         cells = (factor * recovered * problem.profile).reshape(*problem.shape, 3).astype(np.float32)
         r, g, b = (0.0 if bounds[c] or factor == 0.0 else problem.card_share(c, is_bound=False) for c in range(3))
         return Estimate(cells, bounds, emitters, method, factor, card, (r, g, b), interval)
-
-
-def _by_card(problem: Problem) -> tuple[Array, tuple[bool, bool, bool], Array]:
-    """Return the results of ``card_means``, and the missing radiance of parts from the card alone, (parts, 3)."""
-    means, bounds = problem.card_means()
-    return means, bounds, problem.expected[problem.component][:, None] * means
 
 
 def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[bool, bool, bool]) -> Array:

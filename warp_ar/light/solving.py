@@ -82,7 +82,7 @@ class SolvingProcess:
         """True while the process is starting."""
         return not self.ready and self._process is not None and self._process.poll() is None
 
-    def update(self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> tuple[Any, Any]:
+    def update(self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any]) -> tuple[Any, Any]:
         """Solve in the separate process if it is ready, otherwise on this thread.
 
         Args:
@@ -97,16 +97,13 @@ class SolvingProcess:
         solved = self._ask(solver, sides, trace) if self.ready else None
         return (solver, update(solver, sides, trace)) if solved is None else solved
 
-    def _ask(
-        self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None
-    ) -> tuple[Any, Any] | None:
+    def _ask(self, solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any]) -> tuple[Any, Any] | None:
         """Have the process solve; return the updated solver and the solution, or None if the process has died."""
         with self._lock:
             try:
-                self._connection.send((solver, sides, trace is not None))
+                self._connection.send((solver, sides))
                 kind, value = self._connection.recv()
                 while kind == "trace":
-                    assert trace is not None
                     self._connection.send(trace(value))
                     kind, value = self._connection.recv()
             except (EOFError, OSError):
@@ -135,7 +132,7 @@ class SolvingProcess:
             self._end()
 
 
-def update(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any] | None) -> Any:
+def update(solver: Solver, sides: tuple[Any, ...], trace: Callable[[Any], Any]) -> Any:
     """Solve on this thread and return the solution; the arguments are those of ``SolvingProcess.update``."""
     cells, transfer, mirrored, observations, camera = sides
     return solver.update(cells, transfer, mirrored, observations, trace, camera)
@@ -154,10 +151,10 @@ def serve(descriptor: int) -> None:
     with contextlib.suppress(EOFError, OSError), connection:
         connection.send("ready")
         while True:
-            solver, sides, traced = connection.recv()
+            solver, sides = connection.recv()
             answer: tuple[str, Any]
             try:
-                answer = "solved", (solver, update(solver, sides, trace if traced else None))
+                answer = "solved", (solver, update(solver, sides, trace))
             except (EOFError, OSError):
                 raise
             except Exception as error:
