@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal
 
-from warp_ar.kernels.objects.reflect import DiffuseForm, DistantLightConfig
+from warp_ar.kernels.objects.reflect import DistantLightConfig
 from warp_ar.kernels.picture.expose import BOXES
 from warp_ar.kernels.rays.area_lights import POINT_SAMPLES
 from warp_ar.scene import Scene
@@ -166,9 +166,7 @@ def find_features(request: Request) -> Features:
     exposed = "added_light" in layers if isinstance(scale, str) else scale != 1.0
     darkened = exposed and (isinstance(scale, str) or scale < 1.0)
     relight_method = quality.method("relight") if environment else FLAT
-    shines = sheds_light(scene)
     hidden = bool(scene.probes) or any(proxy.shape != "plane" for proxy in scene.proxies)
-    lit_by_both = bool(environment and shines and scene.proxies)
     area_samples = AREA_SAMPLES[area_method(quality)] if any(map(emits_light, scene.objects)) else 0
     placed = recovered or (environment and not observed and request.emitters)
     emitters = placed and quality.method("recover") == "shading"
@@ -176,6 +174,9 @@ def find_features(request: Request) -> Features:
     by_series = quality.method("irradiance") == "sh2" or (by_texture and environment and not observed)
     merged = bracketed and len(request.exposures) > 1
     others = len(scene.probes) - 1 if observed and not merged and interpolates(scene, quality) else 0
+    materials = scene_materials(scene)
+    # Shadows need the irradiance of the receiver.
+    diffuse = "shadow_ratio" in layers or any(map(reflects_diffusely, materials))
     return Features(
         request=request,
         environment=environment,
@@ -189,7 +190,7 @@ def find_features(request: Request) -> Features:
         declipped=darkened and quality.method("expose") == "ball",
         declipped_by_ball=quality.method("expose") == "ball" and recovered,
         relight_method=relight_method,
-        ambient_visibility=lit_by_both and hidden and relight_method in MEASURED,
+        ambient_visibility=environment and "added_light" in layers and hidden and relight_method in MEASURED,
         bounced=relight_method in LOCAL and proxies_face(scene),
         soft_lights=quality.method("light_shadow") == "soft" and any(light.radius > 0.0 for light in scene.lights),
         area_samples=area_samples,
@@ -197,13 +198,16 @@ def find_features(request: Request) -> Features:
         others=others,
         near_field=_near_method(scene, quality) if environment else "",
         irradiance="irradiance_sh" if by_series else "irradiance_map",
-        distant=_find_forms(
-            scene,
-            "sh" if by_series else "map",
+        distant=DistantLightConfig(
+            trace=trace_config(scene),
+            models=tuple(sorted(set(map(material_model, materials)))),
+            textures=is_detailed(scene),
+            diffuse=("sh" if by_series else "map") if environment and diffuse else "none",
+            specular=environment and (any(map(reflects_glossily, materials)) or "reflected" in layers),
+            known=environment,
             emitters=emitters,
             several=others > 0,
             gathered=area_samples == 0,
-            layers=layers,
         ),
     )
 
@@ -259,23 +263,3 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
     if mirrored and scene.has_gloss and has_environment(scene):
         layers.append("reflected")
     return tuple(layers)
-
-
-def _find_forms(
-    scene: Scene, form: DiffuseForm, *, emitters: bool, several: bool, gathered: bool, layers: tuple[str, ...]
-) -> DistantLightConfig:
-    materials = scene_materials(scene)
-    environment = has_environment(scene)
-    # Shadows need the irradiance of the receiver.
-    diffuse = "shadow_ratio" in layers or any(map(reflects_diffusely, materials))
-    return DistantLightConfig(
-        trace=trace_config(scene),
-        models=tuple(sorted(set(map(material_model, materials)))),
-        textures=is_detailed(scene),
-        diffuse=form if environment and diffuse else "none",
-        specular=environment and (any(map(reflects_glossily, materials)) or "reflected" in layers),
-        known=environment,
-        emitters=emitters,
-        several=several,
-        gathered=gathered,
-    )
