@@ -301,7 +301,7 @@ class Scheduler:
                 stage.begin()
             due.append((stage, [step for step in passes if step.enabled is None or step.enabled()]))
             self._seen[stage.name] = versions
-            self.arrays.touch_all(stage.wiring.writes)
+            self.arrays.touch(*stage.wiring.writes)
         return due, skipped
 
     def _run_eager(self, due: list[Step]) -> dict[str, float]:

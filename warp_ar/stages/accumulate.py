@@ -48,31 +48,28 @@ class Accumulate(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the accumulated maps, and the change of each sector (block of texels)."""
-        height = self.request.quality.environment_height
-        shape = (height, 2 * height)
-        others = self.features.others
-        places = {"probe_places": ArraySpec((others + 1,), wp.vec4)} if others else {}
-        change = {"accumulate_others": ArraySpec((others, *accumulate.change_shape(*shape)), wp.vec2)} if others else {}
-        return {
-            **other_maps(self.features, KEPT, shape),
-            **places,
-            **change,
+        shape, others = self.map_shape, self.features.others
+        sectors = accumulate.change_shape(*shape)
+        specs = {
             "environment_radiance": ArraySpec(shape, wp.vec3),
             "environment_confidence": ArraySpec(shape, wp.float32),
             "environment_clipped": ArraySpec(shape, wp.vec3),
-            "accumulate_change": ArraySpec(accumulate.change_shape(*shape), wp.vec2),
+            "accumulate_change": ArraySpec(sectors, wp.vec2),
         }
+        if others:
+            specs["probe_places"] = ArraySpec((others + 1,), wp.vec4)
+            specs["accumulate_others"] = ArraySpec((others, *sectors), wp.vec2)
+        return {**specs, **other_maps(self.features, KEPT, shape)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Return passes that measure the change of light, then update the mean; none runs while a ball is covered."""
-        height = self.request.quality.environment_height
         view = find_view(arrays, self.wiring.reads[0].removesuffix("_radiance"))
         environment, change, params = find_view(arrays, "environment"), arrays["accumulate_change"], arrays["params"]
 
         def follow(view: Any, environment: Any, change: Any) -> list[Pass]:
             return [
                 Pass(lambda rows: accumulate.measure_change(view, environment, change)),
-                over_rows(height, accumulate.accumulate_environment, view, change, params, environment),
+                over_rows(self.map_height, accumulate.accumulate_environment, view, change, params, environment),
             ]
 
         passes = follow(view, environment, change)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 from warp_ar.stages.features import Features
@@ -151,12 +151,8 @@ class Arrays(dict[str, Any]):
             raise ValueError(f"resource {name!r} is already there: two stages may not own one resource")
         self[name], self._versions[name] = array, 0
 
-    def touch(self, name: str) -> None:
-        """Increase the version of ``name`` after a change of its contents."""
-        self._versions[name] += 1
-
-    def touch_all(self, names: Iterable[str]) -> None:
-        """Increase the versions of several resources."""
+    def touch(self, *names: str) -> None:
+        """Increase the versions of resources after a change of their contents."""
         for name in names:
             self._versions[name] += 1
 
@@ -209,6 +205,8 @@ class Stage(abc.ABC):
         self.request = features.request
         width, height = self.request.size
         self.height, self.shape = height, (height, width)
+        rows = self.request.quality.environment_height
+        self.map_height, self.map_shape = rows, (rows, 2 * rows)
 
     @classmethod
     def method_for(cls, features: Features) -> str:

@@ -40,19 +40,18 @@ class Bracket(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of all exposures' maps, of the clipped share near each texel, and of the merged map."""
-        height = self.request.quality.environment_height
         count = len(self.request.exposures)
         types = dict(zip(UNWRAPPED, (wp.vec3, wp.float32, wp.vec3), strict=True))
         return {
-            **{f"merged_{part}": ArraySpec((height, 2 * height), kind) for part, kind in types.items()},
-            **{f"bracket_{part}": ArraySpec((count, height, 2 * height), kind) for part, kind in types.items()},
-            "bracket_spread": ArraySpec((count, height, 2 * height), wp.vec3),
+            **{f"merged_{part}": ArraySpec(self.map_shape, kind) for part, kind in types.items()},
+            **{f"bracket_{part}": ArraySpec((count, *self.map_shape), kind) for part, kind in types.items()},
+            "bracket_spread": ArraySpec((count, *self.map_shape), wp.vec3),
             "bracket_exposures": ArraySpec((count,), kernels.BracketExposure),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Return passes that store the reference's map, find clipping near each texel, and average the exposures."""
-        height = self.request.quality.environment_height
+        height = self.map_height
         reference = self.request.exposures.index(1.0)
         stack = filled(kernels.ExposureStack(), **{part: arrays[f"bracket_{part}"] for part in (*UNWRAPPED, "spread")})
         merged = find_view(arrays, "merged")

@@ -43,24 +43,23 @@ class EnvironmentSamples(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the samples, of the sums by which they are drawn, and for the reference of texels."""
-        height = self.request.quality.environment_height
+        height, width = self.map_shape
         count = sample_count(self.features)
         specs = {
             "environment_samples": ArraySpec((count,), EnvironmentSample, EnvironmentSample()),
             "environment_samples_directions": ArraySpec((count,), wp.vec3),
             "environment_samples_flux": ArraySpec((count,), wp.vec3),
-            "environment_samples_cumulative": ArraySpec((height, 2 * height), wp.float32),
+            "environment_samples_cumulative": ArraySpec(self.map_shape, wp.float32),
             "environment_samples_rows": ArraySpec((height,), wp.vec2),
         }
         if not lists_texels(self.features):
             return specs
         # For a smaller environment the remaining samples have weight 0.
-        texels = REFERENCE_SIZE[0] * REFERENCE_SIZE[1] * sample_slots(self.features)
+        rows, columns = REFERENCE_SIZE
+        texels = rows * columns * sample_slots(self.features)
         return {
             **specs,
-            "environment_samples_map": ArraySpec(
-                (min(REFERENCE_SIZE[0], height), min(REFERENCE_SIZE[1], 2 * height)), wp.vec3
-            ),
+            "environment_samples_map": ArraySpec((min(rows, height), min(columns, width)), wp.vec3),
             "environment_samples_texels": ArraySpec((texels,), EnvironmentSample, EnvironmentSample()),
             "environment_samples_texel_directions": ArraySpec((texels,), wp.vec3),
             "environment_samples_texel_flux": ArraySpec((texels,), wp.vec3),

@@ -44,8 +44,7 @@ class Fill(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the completed environment map and of the fill pyramid."""
-        height = self.request.quality.environment_height
-        shape = (height, 2 * height)
+        shape = self.map_shape
         return {
             **{name: ArraySpec((self.features.others, *shape), wp.vec3) for name in self.wiring.writes[1:]},
             self.wiring.writes[0]: ArraySpec(shape, wp.vec3),

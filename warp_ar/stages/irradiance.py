@@ -62,11 +62,13 @@ class Irradiance(Stage):
         return specs
 
     def _first(self) -> dict[str, ArraySpec]:
-        height = self.request.quality.environment_height
         if self.method == "sphere_mip":
             return {"irradiance_map": ArraySpec(MAP_SIZE, wp.vec3)}
         if self.method == "sh2":
-            return {"irradiance_sh": ArraySpec((9,), wp.vec3), "irradiance_row_sums": ArraySpec((height, 5), wp.vec3)}
+            return {
+                "irradiance_sh": ArraySpec((9,), wp.vec3),
+                "irradiance_row_sums": ArraySpec((self.map_height, 5), wp.vec3),
+            }
         count = math.prod(self._blocks())
         return {
             "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
@@ -74,19 +76,17 @@ class Irradiance(Stage):
         }
 
     def _blocks(self) -> tuple[int, int]:
-        height = self.request.quality.environment_height
+        rows, columns = self.map_shape
         if self.method == "brute_force":
-            return height, 2 * height
-        return min(CLUSTERS[0], height), min(CLUSTERS[1], 2 * height)
+            return rows, columns
+        return min(CLUSTERS[0], rows), min(CLUSTERS[1], columns)
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Return the launches of the method, with the tables that they need."""
         if self.method == "sphere_mip":
             level = int(math.log2(sphere_map.SIZE // sphere_map.DIFFUSE_SIZE))
             known, out = (arrays["params"], arrays["sphere_map"], level, MAP_SIZE), arrays["irradiance_map"].flatten()
-            return [
-                Pass(lambda rows: sphere_map.look_up_level(*known, out, scale=math.pi, rows=rows), rows=MAP_SIZE[0])
-            ]
+            return [over_rows(MAP_SIZE[0], sphere_map.look_up_level, *known, out, scale=math.pi)]
         passes = self._filter(arrays, arrays["environment"], arrays[self.features.irradiance])
         for ball in range(self.features.others_with_irradiance):
             passes += self._filter(arrays, arrays["others_environment"][ball], arrays["others_irradiance"][ball])

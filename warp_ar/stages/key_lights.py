@@ -33,7 +33,7 @@ class KeyLights(Stage):
         """Declare the arrays of the dominant direction and of its partial sums."""
         return {
             "key_lights": ArraySpec((1,), KeyLight),
-            "key_lights_sums": ArraySpec((self.request.quality.environment_height,), wp.vec4),
+            "key_lights_sums": ArraySpec((self.map_height,), wp.vec4),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:

@@ -87,14 +87,14 @@ class Prefilter(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the levels, and the pyramid from which they are filtered."""
-        height = self.request.quality.environment_height
+        height = self.map_height
         specs = {"prefilter_levels": ArraySpec((lobe_texels(height),), wp.vec3)}
         if others := self._others(self.features):
             specs["others_levels"] = ArraySpec((others, lobe_texels(height)), wp.vec3)
         if self.method == "sphere_mip":
             return specs
         if self.method != "brute_force" and not self._mirrors_only:
-            specs["prefilter_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
+            specs["prefilter_pyramid"] = ArraySpec((pyramid.packed_texels(*self.map_shape),), wp.vec3)
             specs["prefilter_row_energy"] = ArraySpec((lobe_rows(height),), wp.vec3)
             specs["prefilter_energy"] = ArraySpec((lobe_count(height),), wp.vec3)
         return specs
@@ -110,7 +110,7 @@ class Prefilter(Stage):
 
     def _filter(self, arrays: Arrays, environment: Any, levels: Any) -> list[Pass]:
         """Return the passes from one map of the environment to its levels; all maps reuse one pyramid."""
-        height, device = self.request.quality.environment_height, environment.device
+        height, device = self.map_height, environment.device
         lobe = scene_lobe(self.request.scene)
         if self._mirrors_only:
             return [over_rows(height, pyramid.copy_safe, environment, levels)]
@@ -136,7 +136,7 @@ class Prefilter(Stage):
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
         """Return one pass per lobe, which writes its map from a sphere map level; mirrors need the first lobe alone."""
-        height = self.request.quality.environment_height
+        height = self.map_height
         lobes = lobe_count(height)
         known, out = (arrays["params"], arrays["sphere_map"]), arrays["prefilter_levels"]
         passes = []

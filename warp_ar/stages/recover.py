@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -130,8 +129,7 @@ class Recover(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the environment map with recovered light, and of the equations for that light."""
-        height, others = self.request.quality.environment_height, self.features.others
-        shape, most = (height, 2 * height), (CONFIG.search.most,)
+        others, shape, most = self.features.others, self.map_shape, (CONFIG.search.most,)
         cells = cell_shape(*shape)
         self._surfaces = find_surfaces(self.request.scene, card_only=self.method == "white_card")
         points, self._card = len(self._surfaces.points), self._card_points()
@@ -139,7 +137,7 @@ class Recover(Stage):
             "environment": ArraySpec(shape, wp.vec3),
             **{f"recover_card_{when}": ArraySpec((self._card,), kernels.Observation) for when in WHEN},
             **{f"recover_upward_{when}": ArraySpec((3,), wp.float32) for when in WHEN},
-            "recover_upward_rows": ArraySpec((height // 2,), wp.vec3),
+            "recover_upward_rows": ArraySpec((self.map_height // 2,), wp.vec3),
             "recover_share": ArraySpec((3,), wp.float32),
             "recover_level": ArraySpec((3,), wp.float32, 1.0),
             "recover_recovered": ArraySpec(cells, wp.vec3),
@@ -189,73 +187,52 @@ class Recover(Stage):
         self._frames_stream: Any = None
         if not self._on_cpu:
             self._stream, self._frames_stream = wp.Stream(device), wp.get_stream(device)
-        height, rows = self.request.quality.environment_height, arrays["recover_cells"].shape[0]
-        looks = (
+        by_card: tuple[Pass, ...] = (
             # The card is in the frame, so it is observed while the map is being unwrapped and filled.
             Pass(self._look_at_card, enabled=lambda: self._asks or self._follows, reads=self.wiring.reads[3:5]),
             Pass(self._sum_upward, enabled=lambda: self._asks or self._follows),
             Pass(self._note_card, enabled=lambda: self._asks),
             Pass(self._follow, enabled=lambda: self._follows),
         )
+        by_card = by_card if self._card else ()
+        shown = "filled_radiance", "environment_confidence", "recover_missing", "recover_cells", "recover_levelled"
         return [
             Pass(self._take, on_host=True, enabled=lambda: self._arrives, beforehand=True),
-            *(looks[:1] if self._card else ()),
-            *self._equations(height, rows),
-            *(looks[1:3] if self._card else ()),
+            *by_card[:1],
+            *self._equations(),
+            *by_card[1:3],
             Pass(self._ask, on_host=True, enabled=lambda: self._asks),
-            *(looks[3:] if self._card else ()),
+            *by_card[3:],
             Pass(self._apply_level),
-            Pass(
-                self._launch(
-                    add_recovered,
-                    *("filled_radiance", "environment_confidence", "recover_missing", "recover_cells"),
-                    *("recover_levelled", "environment"),
-                ),
-                rows=rows,
-            ),
+            over_rows(len(arrays["recover_cells"]), add_recovered, *self._named(*shown, "environment")),
             *(one for ball in range(self.features.others) for one in self._relocate(ball)),
         ]
 
-    def _launch(self, launcher: Any, *names: str) -> Any:
-        """Return a function of a band of rows that calls a launcher with named arrays."""
-        given = [self._arrays[name] for name in names]
-        return lambda rows: launcher(*given, rows=rows)
+    def _named(self, *names: str) -> list[Any]:
+        """Return the named arrays."""
+        return [self._arrays[name] for name in names]
 
-    def _equations(self, height: int, rows: int) -> list[Pass]:
+    def _equations(self) -> list[Pass]:
         """Return the passes that find clipped cells and, in frames that begin an estimate, set up the equations."""
-        points = len(self._surfaces.points)
-
-        def asked(launcher: Any, *names: str, rows: int) -> Pass:
-            launcher = functools.partial(launcher, self._proxies)
-            return Pass(self._launch(launcher, *names), rows=rows, enabled=lambda: self._asks)
-
-        weigh = self._launch(weigh_boundaries, "environment_clipped", "params", "probes", "recover_missing")
+        rows, points, proxies = len(self._arrays["recover_cells"]), len(self._surfaces.points), self._proxies
+        scene, observed = ("probes", "ray_scene"), ("recover_points", "recover_observations")
         # Clipped texels are known before the map is filled.
-        known = "environment_clipped", "pose"
-        passes = [Pass(weigh, rows=height, reads=known)]
-        if self._proxies:
-            leave_out = functools.partial(leave_out_edges, self._proxies)
-            names = "environment_clipped", "probes", "ray_scene", "recover_missing"
-            passes.append(Pass(self._launch(leave_out, *names), rows=rows, reads=known))
+        given = self._named("environment_clipped", "params", "probes", "recover_missing")
+        passes = [over_rows(self.map_height, weigh_boundaries, *given)]
+        if proxies:
+            given = self._named("environment_clipped", *scene, "recover_missing")
+            passes.append(over_rows(rows, leave_out_edges, proxies, *given))
+        shown = "filled_radiance", "environment_confidence", "environment_clipped", "recover_missing"
+        transfer = "recover_traced", "recover_transfer", "recover_mirrored"
+        given = self._named(*observed, "recover_cells_now", *scene, *transfer)
+        asked = [
+            over_rows(rows, condense_cells, proxies, *self._named(*shown, *scene, "recover_cells_now")),
+            over_rows(points, self._observe, *self._named(*observed)),
+            over_rows(points, kernels.trace_transfer, proxies, *given),
+        ]
         return [
-            *passes,
-            asked(
-                condense_cells,
-                *("filled_radiance", "environment_confidence", "environment_clipped", "recover_missing"),
-                *("probes", "ray_scene", "recover_cells_now"),
-                rows=rows,
-            ),
-            Pass(
-                functools.partial(self._observe, self._arrays["recover_points"], self._arrays["recover_observations"]),
-                rows=points,
-                enabled=lambda: self._asks,
-            ),
-            asked(
-                kernels.trace_transfer,
-                *("recover_points", "recover_observations", "recover_cells_now", "probes", "ray_scene"),
-                *("recover_traced", "recover_transfer", "recover_mirrored"),
-                rows=points,
-            ),
+            *(dataclasses.replace(one, reads=("environment_clipped", "pose")) for one in passes),
+            *(dataclasses.replace(one, enabled=lambda: self._asks) for one in asked),
         ]
 
     def _card_points(self) -> int:
@@ -279,7 +256,7 @@ class Recover(Stage):
 
     def _relocate(self, ball: int) -> list[Pass]:
         """Return passes that transfer recovered radiance from the first ball's map to another's, with parallax."""
-        arrays, places, height = self._arrays, self._arrays["probe_places"], self.request.quality.environment_height
+        arrays, places, height = self._arrays, self._arrays["probe_places"], self.map_height
         emitters = arrays["emitters"] if self.features.emitters else None
         first, out = (arrays["environment"], arrays["filled_radiance"]), arrays["others_environment"][ball]
         filled, missing, sent = arrays["others_filled"][ball], arrays["recover_others_missing"], arrays["recover_sent"]
@@ -306,7 +283,7 @@ class Recover(Stage):
         kernels.observe_surfaces(self._proxies, linear, *frame, *scene, points, observations, rows=rows)
 
     def _sum_upward(self, rows: Rows | None) -> None:
-        sum_upward(*(self._arrays[name] for name in ("filled_radiance", "recover_upward_rows", "recover_upward_now")))
+        sum_upward(*self._named("filled_radiance", "recover_upward_rows", "recover_upward_now"))
 
     def _look_at_card(self, rows: Rows | None) -> None:
         arrays = self._arrays

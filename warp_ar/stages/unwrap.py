@@ -59,13 +59,12 @@ class Unwrap(Stage):
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the latlong map, and of the image positions of its texels' corners."""
-        height = self.request.quality.environment_height
-        width = 2 * height
+        height, width = self.map_shape
         specs = {
-            "probe_radiance": ArraySpec((height, width), wp.vec3),
-            "probe_confidence": ArraySpec((height, width), wp.float32),
-            "probe_clipped": ArraySpec((height, width), wp.vec3),
-            **other_maps(self.features, OTHERS, (height, width)),
+            "probe_radiance": ArraySpec(self.map_shape, wp.vec3),
+            "probe_confidence": ArraySpec(self.map_shape, wp.float32),
+            "probe_clipped": ArraySpec(self.map_shape, wp.vec3),
+            **other_maps(self.features, OTHERS, self.map_shape),
         }
         if self.method != "sphere_map":
             if self.features.others:
@@ -78,7 +77,7 @@ class Unwrap(Stage):
         if self.method == "sphere_map":
             return self._look_up(arrays)
         kinds = trace_variant(trace_config(self.request.scene), device).proxies
-        height = self.request.quality.environment_height
+        height = self.map_height
         linear = "linear_frame" in self.wiring.reads
         frame = arrays["linear_frame" if linear else "frame"], arrays["linear_clip" if linear else "decode"]
         probes, corners, others = arrays["probes"], arrays["unwrap_corners"], self.features.others
@@ -95,11 +94,10 @@ class Unwrap(Stage):
 
     def _look_up(self, arrays: Arrays) -> list[Pass]:
         """Return the pass that looks every direction up in the sphere map."""
-        height = self.request.quality.environment_height
-        shape = height, 2 * height
         params, texture, out = arrays["params"], arrays["sphere_map"], arrays["probe_radiance"].flatten()
-        names = "frame", "linear_frame", "linear_clip", "probe_confidence", "probe_clipped"
+        names = "params", "probes", "frame", "linear_frame", "linear_clip", "probe_confidence", "probe_clipped"
+        seen = (arrays[name] for name in names)
         return [
-            over_rows(height, sphere_map.look_up_level, params, texture, 0, shape, out),
-            over_rows(height, sphere_map.trust_ball, params, arrays["probes"], *(arrays[name] for name in names)),
+            over_rows(self.map_height, sphere_map.look_up_level, params, texture, 0, self.map_shape, out),
+            over_rows(self.map_height, sphere_map.trust_ball, *seen),
         ]
