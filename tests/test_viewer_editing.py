@@ -279,15 +279,20 @@ def refuse_a_file(tab: Tab, artefacts: Path) -> None:
     tab.errors = [error for error in tab.errors if "422" not in error]  # the refused one, which was asked for
 
 
-def test_files_in_and_out(open_tab: Callable[..., Tab], tmp_path: Path, artefacts: Path) -> None:
+def test_files_in_and_out_and_a_box_that_is_pointed_out(
+    open_tab: Callable[..., Tab], tmp_path: Path, artefacts: Path
+) -> None:
     tab = open_tab()
     save_files(tab, tmp_path)
+    point_a_box_out(tab, artefacts)
+    tab.page.click("#play")
+    tab.until("warpAr.state.playing")
     drop_a_mesh(tab)
     refuse_a_file(tab, artefacts)
 
 
-def test_a_box_is_pointed_out_and_edited(open_tab: Callable[..., Tab], artefacts: Path) -> None:
-    tab = open_tab()
+def point_a_box_out(tab: Tab, artefacts: Path) -> None:
+    """By its corners; then it is edited like anything else."""
     page = tab.page
     truth = page.evaluate("warpAr.scene.proxies.find(p => p.shape === 'box')")
     place = page.evaluate("warpAr.scene.proxies.findIndex(p => p.shape === 'box')")
