@@ -175,15 +175,17 @@ class BudgetSetting:
         """Return each preset's milliseconds per frame and the number of measured frames.
 
         A preset that has run gets the median of its frames; the base otherwise gets its measured cost. Others get the
-        cost table's value, scaled by the mean ratio of measured to tabulated times, and the time of tracking, which the
+        cost table's value, scaled by the ratio of measured to tabulated times, and the time of tracking, which the
         table leaves out. A preset that has not run and is not in the table is left out. Callable from any thread.
         """
         offer = self._offer  # read once, as measuring sets it
         ran = {BASE.name: (offer["base"], 0)} if offer else {}
         ran |= {name: (statistics.median(ms), len(ms)) for name, ms in list(self._preset_ms.items()) if ms}
         tracking, _ = ran.pop(TRACK, (0.0, 0))
-        ratios = [(ran[name][0] - tracking) / ms for name, ms in self._table.items() if name in ran] or [1.0]
-        scaled = {name: (ms * statistics.mean(ratios) + tracking, 0) for name, ms in self._table.items()}
+        known = {name: ms for name, ms in self._table.items() if name in ran}
+        # Sums: the ratio of a cheap preset alone would tell more of the page's own work than of the stages'.
+        ratio = sum(ran[name][0] - tracking for name in known) / sum(known.values()) if known else 1.0
+        scaled = {name: (ms * ratio + tracking, 0) for name, ms in self._table.items()}
         return {name: {"ms": round(ms, 2), "frames": count} for name, (ms, count) in (scaled | ran).items()}
 
     def forget_costs(self, preset: str | None = None) -> None:

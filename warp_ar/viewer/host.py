@@ -192,11 +192,6 @@ class Host:
         source = self._controls.feed.source
         return source if isinstance(source, NoCamera) else None
 
-    @property
-    def description(self) -> str:
-        """Description of the source in one line; files are named without their folders."""
-        return self._controls.feed.source.description.rsplit("/", 1)[-1]
-
     def wanted(self) -> Wanted:
         """Return the state that viewers see, at the latest once its pipeline is built."""
         return self._controls.wanted
@@ -356,7 +351,7 @@ class Host:
         return {
             "type": "state",
             "fps": round(self.fps, 2),
-            "source": self.description,
+            "source": controls.feed.source.description.rsplit("/", 1)[-1],  # a file without its folders
             "camera": controls.feed.is_browser,
             "lens": self._lens(),
             "missing": self._missing(),
