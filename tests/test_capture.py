@@ -204,16 +204,17 @@ def test_raw_photographs_need_no_response(tmp_path):
         capture_light(photos, device="cpu", transfer="gamma:2.2")
 
 
-def test_an_outline_of_another_photograph_is_said(tmp_path):
-    """Of one so dark that no rim is seen in it."""
+def test_a_shown_photograph_without_a_rim_is_refused_with_the_balls_place(tmp_path):
     clear = write_photo(tmp_path / "clear.jpg", exposed(60), denominator=60)
     black = write_photo(tmp_path / "black.jpg", np.zeros_like(exposed(60)), denominator=60000)
-    found = capture_light([clear, black], device="cpu", shown=1)
-    (said,) = [note for note in found.notes if "rim of the ball" in note]
-    assert said.startswith("black.jpg shows no rim of the ball: this outline is that of clear.jpg")
-    assert "--shown" in said
+    with pytest.raises(UsageError, match=r"^black\.jpg shows no rim of the ball: .*--shown.*clear\.jpg") as refused:
+        capture_light([clear, black], device="cpu", shown=1)
     # By a far camera, of the JPEG: the outline was found in the picture itself here.
-    assert found.outline.center == pytest.approx(find_ball(exposed(60).astype(np.uint8)).center, abs=0.5)
+    told = [float(value) for value in str(refused.value).split("--circle ")[1].rstrip(")").split()]
+    assert told[:2] == pytest.approx(find_ball(exposed(60).astype(np.uint8)).center, abs=0.5)
+    assert capture_light([clear, black], device="cpu", shown=1, circle=told).outline.center == pytest.approx(
+        told[:2], abs=0.5
+    )
 
 
 def test_a_focal_length_that_is_given_counts_for_a_cut_picture_too(tmp_path):

@@ -58,7 +58,7 @@ TRUE = [1 / d for d in BRACKET]
 
 
 def test_true_exposures_and_srgb_are_confirmed():
-    agreed = agree_exposures(patches(BRACKET), "srgb", TRUE, None)
+    agreed = agree_exposures(patches(BRACKET), "srgb", {"EXIF": TRUE})
     assert agreed.ratios == pytest.approx([t / TRUE[0] for t in TRUE])
     assert agreed.curve is None
     assert agreed.notes == ()
@@ -67,7 +67,7 @@ def test_true_exposures_and_srgb_are_confirmed():
 def test_lying_exposures_are_refused_with_all_three_figures():
     lying, names = [1.0, 0.8, 0.7, 0.5], [1.0, 1 / 9, 1 / 81, 1 / 729]
     with pytest.raises(UsageError) as caught:
-        agree_exposures(patches(BRACKET), "srgb", lying, names)
+        agree_exposures(patches(BRACKET), "srgb", {"EXIF": lying, "names": names})
     message = str(caught.value)
     for figure in ("EXIF says 2", "names say 729", "pixels say"):
         assert figure in message
@@ -76,22 +76,22 @@ def test_lying_exposures_are_refused_with_all_three_figures():
 
 def test_two_wrong_times_contradict_the_pictures_under_every_response():
     with pytest.raises(UsageError, match=r"no response explains them \(b to c is off by"):
-        agree_exposures(patches(BRACKET), "srgb", [1.0, 0.1, 0.06, 0.045], None, labels="abcd")
+        agree_exposures(patches(BRACKET), "srgb", {"EXIF": [1.0, 0.1, 0.06, 0.045]}, labels="abcd")
 
 
 def test_a_missing_photograph_is_named_and_the_pixels_believed():
     """At the end it looks like a wrong time of the last; in between, all after it are wrong."""
-    agreed = agree_exposures(patches((15, 60, 1000)), "srgb", TRUE[:3], None, labels="abc")
+    agreed = agree_exposures(patches((15, 60, 1000)), "srgb", {"EXIF": TRUE[:3]}, labels="abc")
     assert agreed.ratios == pytest.approx([1.0, 0.25, 0.015], rel=0.1)
     assert agreed.curve is None
     assert agreed.notes[0].startswith("c: EXIF gives it 3.9")
-    agreed = agree_exposures(patches((15, 60, 500, 1000)), "srgb", [1.0, 0.25, 1 / 8, 1 / 16], None, labels="abcd")
+    agreed = agree_exposures(patches((15, 60, 500, 1000)), "srgb", {"EXIF": [1.0, 0.25, 1 / 8, 1 / 16]}, labels="abcd")
     assert agreed.ratios == pytest.approx([1.0, 0.25, 0.03, 0.015], rel=0.1)
     assert agreed.notes[0].startswith("is a photograph missing between b and c? EXIF gives the second")
 
 
 def test_a_response_that_one_step_needs_is_doubted():
-    agreed = agree_exposures(patches((15, 60)), "srgb", [1.0, 0.16], None, labels="ab")
+    agreed = agree_exposures(patches((15, 60)), "srgb", {"EXIF": [1.0, 0.16]}, labels="ab")
     assert agreed.curve is not None
     assert agreed.notes[1].startswith("only the step from a to b needs this response; if a time is wrong instead, srgb")
 
@@ -104,7 +104,7 @@ def s_curve(light):
 
 def test_a_response_is_estimated_where_srgb_does_not_hold():
     bracket = (15, 30, 60, 125, 250, 500)
-    agreed = agree_exposures(patches(bracket, s_curve), "srgb", [1 / d for d in bracket], None)
+    agreed = agree_exposures(patches(bracket, s_curve), "srgb", {"EXIF": [1 / d for d in bracket]})
     assert agreed.curve is not None
     (note,) = agreed.notes
     assert "response is not srgb" in note
@@ -121,7 +121,7 @@ def test_a_response_is_estimated_where_srgb_does_not_hold():
 @pytest.mark.parametrize(("count", "wrong"), [(4, 0), (4, 1), (4, 3), (3, 0), (3, 1), (3, 2)])
 def test_one_wrong_time_is_named_and_the_pixels_believed(count, wrong):
     claim = [t * (2.5 if k == wrong else 1.0) for k, t in enumerate(TRUE[:count])]
-    agreed = agree_exposures(patches(BRACKET[:count]), "srgb", claim, None, labels="abcd"[:count])
+    agreed = agree_exposures(patches(BRACKET[:count]), "srgb", {"EXIF": claim}, labels="abcd"[:count])
     assert agreed.ratios == pytest.approx([t / TRUE[0] for t in TRUE[:count]], rel=0.1)
     assert agreed.curve is None
     assert agreed.notes[0].startswith(f"{'abcd'[wrong]}: EXIF gives it 2.")
@@ -131,18 +131,18 @@ def test_one_wrong_time_is_named_and_the_pixels_believed(count, wrong):
 def test_of_three_times_that_disagree_the_wrong_one_is_doubted(wrong):
     """By a factor that another response explains as well; two of them agree with each of several readings."""
     claim = [t * (1.5 if k == wrong else 1.0) for k, t in enumerate(TRUE[:3])]
-    first, *_ = agree_exposures(patches(BRACKET[:3]), "srgb", claim, None, labels="abc").notes
+    first, *_ = agree_exposures(patches(BRACKET[:3]), "srgb", {"EXIF": claim}, labels="abc").notes
     assert first.startswith(f"{'abc'[wrong]}: EXIF gives it 1.")
     assert "or else" in first
     assert first.endswith("the times disagree, and the first is taken to be wrong")
-    bent = agree_exposures(patches(BRACKET[:3], s_curve), "srgb", claim, None, labels="abc")
+    bent = agree_exposures(patches(BRACKET[:3], s_curve), "srgb", {"EXIF": claim}, labels="abc")
     assert "if a time is wrong instead" in bent.notes[-1]
 
 
 def test_a_response_of_no_camera_is_doubted_with_both_readings():
     """Times as of other photographs: a curve explains them, but none that a camera has."""
     lying = [t**1.6 for t in TRUE]
-    agreed = agree_exposures(patches(BRACKET), "srgb", lying, None)
+    agreed = agree_exposures(patches(BRACKET), "srgb", {"EXIF": lying})
     assert agreed.curve is not None
     assert "no known camera has this response: gamma 3." in agreed.notes[1]
     assert "--exposures pixels is right (EXIF says 828, pixels say 6" in agreed.notes[1]
@@ -151,7 +151,7 @@ def test_a_response_of_no_camera_is_doubted_with_both_readings():
 def test_a_linear_response_of_8_bits_is_doubted():
     """Times with half of the true steps: sRGB with them looks as a linear camera does."""
     halved = [math.sqrt(t) for t in TRUE]
-    agreed = agree_exposures(patches(BRACKET), "srgb", halved, None)
+    agreed = agree_exposures(patches(BRACKET), "srgb", {"EXIF": halved})
     assert any("no known camera has this response: gamma 1." in note for note in agreed.notes)
 
 
@@ -217,7 +217,7 @@ def test_a_blurred_picture_is_softer_than_both_neighbours(blurred):
 
 
 def test_without_any_claim_the_pixels_decide():
-    agreed = agree_exposures(patches(BRACKET), "srgb", None, None)
+    agreed = agree_exposures(patches(BRACKET), "srgb", {})
     steps = [b / a for a, b in itertools.pairwise(agreed.ratios)]
     assert steps == pytest.approx([0.25, 0.24, 0.25], rel=0.1)
     assert "pixels alone" in agreed.notes[0]

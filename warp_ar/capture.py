@@ -116,9 +116,6 @@ def _check(options: argparse.Namespace) -> None:
         options.exposures = PIXELS
     elif options.exposures is not None and PIXELS in options.exposures:
         raise UsageError(f"--exposures {PIXELS} cannot be combined with exposure times")
-    elif options.exposures is not None and len(options.exposures) != len(options.photos):
-        number = counted(len(options.photos), "photograph")
-        raise UsageError(f"{counted(len(options.exposures), 'exposure')} for {number}; expected one for each")
     _check_radius(options)
     options.outline = options.outline or options.output.with_suffix(OUTLINE)
     writes = {"--output": options.output, "--outline": options.outline, "--scene": options.scene}

@@ -19,7 +19,7 @@ from warp_ar.calibration.response import write_response
 from warp_ar.checks.check_ball import DULL, disc_contrast
 from warp_ar.declared import checked
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, counted
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.recovery.recover_cells import cell_shape
 from warp_ar.light.captured import Light, find_emitters, irradiance_above, texel_solid_angles
@@ -130,9 +130,10 @@ def capture_light(
     """
     if not paths:
         raise UsageError("no photographs; expected one or more of a mirror ball")
+    if exposures is not None and not isinstance(exposures, str) and len(exposures) != len(paths):
+        told, wanted = counted(len(exposures), "exposure"), counted(len(paths), "photograph")
+        raise UsageError(f"{told} for {wanted}; expected one for each")
     photos = [read_photograph(path) for path in paths]
-    if exposures is not None and not isinstance(exposures, str) and len(exposures) != len(photos):
-        raise UsageError(f"{len(exposures)} exposures for {len(photos)} photographs; expected one for each")
     if shown is not None and not 0 <= shown < len(photos):
         raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
     # The best exposed, and another one if most differ from it: the odd one may be any.
@@ -144,25 +145,20 @@ def capture_light(
         try:
             if circle is None:
                 near = photos if shown is not None else [reference]
-                outline, taken_from = _find_outline(near, reference, camera, ball)
+                outline = _find_outline(near, reference, camera, ball)
             else:
-                outline, taken_from = exact_outline(reference.image, camera, circle), None
+                outline = exact_outline(reference.image, camera, circle)
             bracket = _merge_plan(photos, reference, outline, transfer, exposures)
         except UsageError as error:
             problem = problem or error
             continue
-        plans.append((reference, camera, notes, outline, taken_from, bracket))
+        plans.append((reference, camera, notes, outline, bracket))
         if not bracket.is_odd:
             break
     if problem is not None and not plans:
         raise problem
-    reference, camera, notes, outline, taken_from, bracket = plans[0 if plans[-1][-1].is_odd else -1]
+    reference, camera, notes, outline, bracket = plans[0 if plans[-1][-1].is_odd else -1]
     notes += [*bracket.notes, _describe_outline(outline)]
-    if taken_from is not None:
-        notes.append(
-            f"{reference.name} shows no rim of the ball: this outline is that of {taken_from.name}, at the same place; "
-            "if the camera moved in between, show a brighter photograph (--shown)"
-        )
     if outline.doubts:
         notes.append(
             f"this outline is doubtful ({'; '.join(outline.doubts)}): look at its picture; if it is wrong, give a "
@@ -254,35 +250,19 @@ def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tu
 
 def _find_outline(
     photos: Sequence[Photograph], reference: Photograph, camera: Camera, ball: Sequence[float] | None
-) -> tuple[BallOutline, Photograph | None]:
-    """Return the ball's outline in the shown photograph, found by its place in the best exposed one.
-
-    Returns:
-        The outline; and the best exposed photograph if the outline is taken from it, because the shown one shows no
-            rim, else None.
-    """
+) -> BallOutline:
+    """Return the ball's outline in the shown photograph, searched near its place in the best exposed one."""
     clearest = photos[_by_exposure(photos)[0]]
     if ball is not None or clearest is reference:
-        return _find_ball(reference, camera, ball), None
+        return _find_ball(reference, camera, ball)
     seen = _find_ball(clearest)
     rough = _same_place((*seen.center, seen.radius), clearest.image, reference.image)
     try:
-        own, taken_from = find_ball(reference.image, camera, rough, NEAR), None
-    except UsageError:
-        # The rim is not visible because the photograph is too dark or too bright: it is aligned by its reflections
-        # instead.
-        x, y, z = map(float, sphere_of_circle(camera, *rough))
-        larger = rough[2] / seen.radius
-        (major, minor), (dx, dy, dr) = seen.axes, seen.deviation
-        own = dataclasses.replace(
-            seen,
-            center=rough[:2],
-            axes=(larger * major, larger * minor),
-            deviation=(larger * dx, larger * dy, larger * dr),
-            sphere=(x, y, z),
-        )
-        taken_from = clearest
-    return dataclasses.replace(own, evidence=seen.evidence), taken_from
+        return dataclasses.replace(find_ball(reference.image, camera, rough, NEAR), evidence=seen.evidence)
+    except UsageError as problem:
+        at = " ".join(f"{value:.1f}" for value in rough)
+        right = f"show a brighter photograph (--shown), or give the circle of {clearest.name} (--circle {at})"
+        raise UsageError(f"{reference.name} shows no rim of the ball: {right}") from problem
 
 
 def _find_ball(photo: Photograph, camera: Camera | None = None, ball: Sequence[float] | None = None) -> BallOutline:
@@ -341,18 +321,19 @@ def _merge_plan(
     if len(photos) == 1:
         note = f"one photograph gives no response: {transfer} is assumed; with a phone's, darks may be 3 times darker"
         return _Bracket((reference,), (circle,), (1.0,), None, (note,))
-    claims: dict[str, Sequence[float] | None] = {"given": None, "exif": None, "names": None}
-    if not isinstance(given, str):
-        claims = {"given": given, "exif": exposures_by_exif(photos), "names": exposures_by_name(photos)}
+    claims: dict[str, Sequence[float] | None] = {"EXIF": exposures_by_exif(photos), "names": exposures_by_name(photos)}
+    if given is not None:
+        claims = {} if isinstance(given, str) else {"--exposures": given}
     told = [photo.info.exposure is not None for photo in photos]
     untold = [photo for photo, tells in zip(photos, told, strict=True) if any(told) and not tells]
     # Sort by brightness, which gives the order even if stated exposures contradict each other.
     order = sorted(range(len(photos)), key=lambda k: -float(photos[k].image[::8, ::8].mean()))
     chosen = [photos[k] for k in order]
-    known = next((claim for claim in claims.values() if claim is not None), None)
-    times = None if known is None else [known[k] for k in order]
+    picked = {name: [claim[k] for k in order] for name, claim in claims.items() if claim is not None}
     rough = [_same_place(circle, reference.image, photo.image) for photo in chosen]
-    aligned = align([photo.image for photo in chosen], rough, times, chosen.index(reference))
+    aligned = align(
+        [photo.image for photo in chosen], rough, next(iter(picked.values()), None), chosen.index(reference)
+    )
     cut = [", and was cut or resized" * (photo.image.shape != reference.image.shape) for photo in chosen]
     notes = [
         f"{one.name} is left out: {why}{how}"
@@ -366,11 +347,13 @@ def _merge_plan(
     stay = [k for k, why in enumerate(aligned.strangers) if not why]
     soft = find_soft([aligned.patches[k] for k in stay])
     notes += [f"{chosen[stay[k]].name} is blurred: leave it out if the others show all of the light" for k in soft]
-    picked = {name: None if claim is None else [claim[order[k]] for k in stay] for name, claim in claims.items()}
     agreed = agree_exposures(
-        [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"],
-        [chosen[k].name for k in stay], known=all(raw),
-    )  # fmt: skip
+        [aligned.patches[k] for k in stay],
+        transfer,
+        {name: [claim[k] for k in stay] for name, claim in picked.items()},
+        [chosen[k].name for k in stay],
+        known=all(raw),
+    )
     first = [chosen[k] for k in stay].index(reference)
     kept, more = thin_exposures(agreed.ratios, first, [chosen[k].name for k in stay])
     return _Bracket(

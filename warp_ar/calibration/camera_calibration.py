@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.calibration.board_finder import BENT, STRAIGHT, find_markers, recognise_board, smallest_dictionary
-from warp_ar.errors import SceneError, UsageError, reason
+from warp_ar.errors import UsageError, reason
 from warp_ar.files import store
 from warp_ar.scene import Camera, CharucoBoard, Marker
 from warp_ar.scene.calibration_file import rational_of_fisheye
@@ -162,7 +162,8 @@ class BoardViews:
         """Calibrate the camera: pinhole with distortion, or fisheye [KB06].
 
         Raises:
-            UsageError: if too few views show the board, or the lens is wider than supported.
+            UsageError: if too few views show the board.
+            SceneError: if the lens is wider than supported.
         """
         size, fisheye = self._size, self._fisheye
         if size is None or self.marker is None or len(self.views) < _FEWEST_VIEWS:
@@ -181,7 +182,7 @@ class BoardViews:
             kept = self.views
         error, matrix, rotations = result.error, result.matrix, result.rotations
         terms = tuple(map(float, np.ravel(result.distortion)))
-        distortion = _rational(size, matrix, terms) if fisheye else terms
+        distortion = rational_of_fisheye(*size, matrix, terms) if fisheye else terms
         deviation = max(result.deviation, _spread(kept, size, fisheye))
         camera = Camera(*size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion)
         covered = _covered(kept, size)
@@ -231,8 +232,8 @@ def calibrate_camera(
         fisheye: True for a fisheye lens.
 
     Raises:
-        UsageError: if the board is no ChArUco board, sizes differ, too few views show it, or the lens is wider than
-            supported.
+        UsageError: if the board is no ChArUco board, sizes differ, or too few views show it.
+        SceneError: if the lens is wider than supported.
     """
     views = BoardViews(marker, board, fisheye=fisheye)
     for image in images:
@@ -306,13 +307,6 @@ def _solve_fisheye(views: _Views, size: tuple[int, int]) -> _Solution:
     ]
     errors = [np.sqrt(((one - seen) ** 2).sum(-1).mean()) for one, seen in zip(found, pixels, strict=True)]
     return _Solution(float(error), matrix, distortion, rotations, 0.0, np.array(errors))
-
-
-def _rational(size: tuple[int, int], matrix: NDArray[Any], terms: tuple[float, ...]) -> tuple[float, ...]:
-    try:
-        return rational_of_fisheye(*size, matrix, terms)
-    except SceneError as error:
-        raise UsageError(f"--fisheye: {error}") from None
 
 
 def _spread(views: _Views, size: tuple[int, int], fisheye: bool) -> float:

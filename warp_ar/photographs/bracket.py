@@ -27,7 +27,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -62,8 +62,6 @@ UNEVEN = 0.05
 """Mean error of a response, as a logarithm, above which a time may be wrong: true times leave 0.02, at most 0.08."""
 EXPLAINS = 0.4
 """Largest error that a wrong time leaves, relative to the error without it."""
-FAR = 40.0
-"""Ratio of exposures above which two pictures share no usable pixels."""
 NOISE = 4
 """Codes by which noise and compression change a pixel."""
 SATURATED = 235
@@ -203,7 +201,7 @@ def align(
     Args:
         images: uint8 RGB, in order of exposure.
         circles: Approximate circle of the ball in each; exact for the anchor.
-        exposures: Exposure of each, if known; pictures with a ratio above ``FAR`` cannot be aligned with each other.
+        exposures: Exposure of each, if known.
         anchor: Index of the picture with which the others are aligned.
     """
     cut = int(np.clip(2.1 * circles[anchor][2], 48, PATCH))
@@ -215,8 +213,6 @@ def align(
     for k in sorted(set(range(count)) - {anchor}, key=lambda k: abs(k - anchor)):
         (x, y, radius), rough, least = circles[k], patches[k], math.inf
         for base in (anchor, *sorted(good[1:], key=lambda other: abs(k - other))):
-            if abs(times[k] - times[base]) > math.log(FAR):
-                continue
             move, pixel = register(patches[base], rough, disc), 2.1 * radius / size
             circle = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])
             patch = cut_ball(images[k], circle, size)
@@ -275,7 +271,7 @@ def disagreement(first: Image, other: Image, step: float | None = None) -> float
     clips, ends = (cv2.dilate(np.uint8(one.max(2) >= SATURATED), np.ones((5, 5))) > 0 for one in both)
     u, v = (cv2.cvtColor(cv2.GaussianBlur(one, (0, 0), 1.0), cv2.COLOR_RGB2GRAY) for one in both)
     well = disc & ~clips & ~ends & (u > DARKEST) & (v > DARKEST)
-    if well.sum() >= max(LEAST_PIXELS, SHARED * disc.sum()):
+    if well.sum() >= SHARED * disc.sum():
         ratio, level = _LOG_SRGB[v[well]] - _LOG_SRGB[u[well]], u[well] // 8
         known = np.flatnonzero(np.bincount(level) > 20)
         steps = np.array([np.median(ratio[level == k]) for k in known])
@@ -441,19 +437,11 @@ def _reading(correction: Array, best: str, labels: Sequence[str]) -> str:
     """Return a correction in words."""
     which = np.flatnonzero(correction)
     gives = f"{best} give{'s' * (best == 'EXIF')}"
-    times = _number(math.exp(-correction[which[0]]))
+    times = f"{math.exp(-correction[which[0]]):.3g}"
     if len(which) == 1:
         return f"{labels[which[0]]}: {gives} it {times} times the exposure that pixels tell"
     between = f"{labels[which[0] - 1]} and {labels[which[0]]}"
     return f"is a photograph missing between {between}? {gives} the second {times} times the exposure that pixels tell"
-
-
-def _total(steps: Sequence[float]) -> float:
-    return 1.0 / math.prod(steps)
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
 
 
 def _believed(steps: dict[str, tuple[float, ...]], seen: Sequence[float], figures: str) -> tuple[str, list[str]]:
@@ -477,9 +465,7 @@ def _believed(steps: dict[str, tuple[float, ...]], seen: Sequence[float], figure
 def agree_exposures(
     patches: Sequence[Image],
     transfer: str,
-    exif: Sequence[float] | None,
-    names: Sequence[float] | None,
-    given: Sequence[float] | None = None,
+    claims: Mapping[str, Sequence[float]],
     labels: Sequence[str] = (),
     known: bool = False,
 ) -> Exposures:
@@ -488,9 +474,7 @@ def agree_exposures(
     Args:
         patches: Aligned pictures, longest exposure first.
         transfer: Response to try first.
-        exif: Exposure of each by its EXIF; None if unknown.
-        names: Exposure of each by its file name; None if unknown.
-        given: Exposure of each given by the user, which takes precedence.
+        claims: Exposure of each by ``EXIF`` and ``names``, as far as known, or by ``--exposures``.
         labels: Names of the pictures.
         known: True if ``transfer`` is certain, so that no response is estimated.
 
@@ -500,16 +484,10 @@ def agree_exposures(
     labels = labels or [f"picture {k + 1}" for k in range(len(patches))]
     levels, tried = _levels(patches), decode_table(transfer).astype(float)
     seen = _steps(levels, tried, len(patches) - 1)
-    steps = {
-        name: tuple(b / a for a, b in itertools.pairwise(claim))
-        for name, claim in (("--exposures", given), ("EXIF", exif), ("names", names))
-        if claim is not None
-    }
-    if given is not None:
-        steps = {"--exposures": steps["--exposures"]}
-    figures = ", ".join(f"{name} say{'s' * (name == 'EXIF')} {_number(_total(s))}" for name, s in steps.items())
+    steps = {name: tuple(b / a for a, b in itertools.pairwise(claim)) for name, claim in claims.items()}
+    figures = ", ".join(f"{name} say{'s' * (name == 'EXIF')} {1.0 / math.prod(s):.3g}" for name, s in steps.items())
     pixels = [s for s in seen if math.isfinite(s)]
-    figures += f"{', ' * bool(figures)}pixels say {_number(_total(pixels))}" + " over the steps that they tell" * (
+    figures += f"{', ' * bool(figures)}pixels say {1.0 / math.prod(pixels):.3g}" + " over the steps that they tell" * (
         len(pixels) < len(seen)
     )
     if not steps:
@@ -550,7 +528,7 @@ def agree_exposures(
         )
     notes.append(
         f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, "
-        f"{_number(float(tried[40, 1] / max(curve[40, 1], 1e-9)))} times at code 40): it was estimated from the bracket"
+        f"{tried[40, 1] / max(curve[40, 1], 1e-9):.3g} times at code 40): it was estimated from the bracket"
     )
     needed = np.flatnonzero(np.abs(np.log(claim / seen)) > HOLDS)
     if len(needed) == 1:
@@ -581,11 +559,11 @@ def thin_exposures(
         Indices, longest exposure first, and a note for each that is left out.
     """
     kept, notes = [shown], []
-    for k in sorted(range(len(ratios)), key=lambda k: -ratios[k]):
-        near = [other for other in kept if abs(math.log(ratios[k] / ratios[other])) < math.log(WAVERING)]
-        if k != shown and near:
-            ratio = max(ratios[k] / ratios[near[0]], ratios[near[0]] / ratios[k])
-            notes.append(f"{names[k]} is left out: its exposure and that of {names[near[0]]} are {ratio:.2f} apart")
-        elif k != shown:
+    for k in sorted(set(range(len(ratios))) - {shown}, key=lambda k: -ratios[k]):
+        apart = {other: math.exp(abs(math.log(ratios[k] / ratios[other]))) for other in kept}
+        near = min(apart, key=lambda other: apart[other])
+        if apart[near] < WAVERING:
+            notes.append(f"{names[k]} is left out: its exposure and that of {names[near]} are {apart[near]:.2f} apart")
+        else:
             kept.append(k)
     return tuple(sorted(kept, key=lambda k: -ratios[k])), tuple(notes)

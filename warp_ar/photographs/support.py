@@ -272,26 +272,14 @@ def plane_from_rectangle(
         raise UsageError("rectangle: its corners lie on a line; pick four that span an area")
     if area > 0:
         corners_3d[:, 1] *= -1
-    pose, error = _solve(camera, corners_3d, points)
-    normals = []
-    rng = np.random.default_rng(0)
-    for _ in range(24):
-        moved, _ = _solve(camera, corners_3d, points + picked * rng.normal(size=(4, 2)))
-        normals.append(moved.rotation[:, 2])
-    spread = np.degrees(np.arccos(np.clip(np.array(normals) @ pose.rotation[:, 2], -1.0, 1.0)))
-    return Support(pose, float(np.sqrt((spread**2).mean())), error)
-
-
-def _solve(camera: Camera, corners: Array, points: Array) -> tuple[Pose, float]:
-    found, rotations, translations, errors = cv2.solvePnPGeneric(
-        corners, points, camera.matrix(), np.array(camera.distortion), flags=cv2.SOLVEPNP_IPPE
-    )
-    # Of the two solutions for a plane, the one that explains the corners better and shows it from above.
-    for k in np.argsort(np.array(errors).ravel()) if found else ():
-        rotation, translation = cv2.Rodrigues(rotations[k])[0], translations[k].ravel()
-        if translation[2] > 0 and (rotation.T @ -translation)[2] > 0:
-            return Pose(rotation, translation), float(np.array(errors).ravel()[k])
-    raise UsageError("rectangle: no plane in front of the camera looks like that; give its corners in order around it")
+    found = plane_from_points(camera, corners_3d, points)
+    up = found.pose.rotation[:, 2]
+    if up @ found.pose.translation >= 0.0:
+        raise UsageError("rectangle: no plane seen from above looks like that; give its corners in order around it")
+    moves = picked * np.random.default_rng(0).normal(size=(24, 4, 2))
+    normals = [plane_from_points(camera, corners_3d, points + move).pose.rotation[:, 2] for move in moves]
+    spread = np.degrees(np.arccos(np.clip(np.array(normals) @ up, -1.0, 1.0)))
+    return dataclasses.replace(found, tilt_deviation=float(np.sqrt((spread**2).mean())))
 
 
 def plane_from_contact(
