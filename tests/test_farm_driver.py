@@ -10,7 +10,7 @@ import pytest
 from tests.farm_rig import make_jobs
 from warp_ar.errors import UsageError
 from warp_ar.farm.driver import Driver
-from warp_ar.farm.jobs import Job, Outcome
+from warp_ar.farm.jobs import Job, Outcome, variations_of
 from warp_ar.farm.manifest import RECORD, Manifest, RunError, describe_inputs
 
 FRAMES = 10
@@ -26,7 +26,7 @@ class Workers:
         self.busy, self.most = set(), 0
         self.closed = False
 
-    def submit(self, worker, job, arguments):
+    def submit(self, worker, job):
         self.busy.add(worker)
         self.most = max(self.most, len(self.busy))
         said = self.behave(job, self.given.count(job))
@@ -53,15 +53,12 @@ class Workers:
 
 def drive(jobs, folder, behave=lambda job, before: None, **options):
     folder.mkdir(exist_ok=True)
-    manifest = Manifest(folder, write=True)
     pool = Workers(jobs, folder, behave, **options)
-    said: list[str] = []
     try:
-        failed = Driver(jobs, folder, manifest, pool, said.append).run()
+        failed = Driver(jobs, folder, Manifest(folder), pool).run()
     finally:
-        manifest.close()
         assert pool.closed
-    return pool, failed, said
+    return pool, failed
 
 
 @pytest.fixture
@@ -74,7 +71,7 @@ def keys(jobs, given):
 
 
 def test_every_job_is_given_once_and_joined_last(jobs, tmp_path):
-    pool, failed, _ = drive(jobs, tmp_path / "run")
+    pool, failed = drive(jobs, tmp_path / "run")
     given = keys(jobs, pool.given)
     assert len(given) == len(set(given)) == 3 * (1 + 5 + 1)
     for name in "abc":
@@ -84,15 +81,15 @@ def test_every_job_is_given_once_and_joined_last(jobs, tmp_path):
     assert pool.most == 3, "all workers must have been busy at once"
 
 
-def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path):
+def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path, capsys):
     def behave(job, before):
         return Outcome("failed", reason="frame 3 cannot be decoded") if job == Job("segment", 1, 2, 4, 6) else None
 
-    pool, failed, said = drive(jobs, tmp_path / "run", behave)
+    pool, failed = drive(jobs, tmp_path / "run", behave)
     given = keys(jobs, pool.given)
     assert given.count("b/segment-000002") == 2
     assert failed == {"b/segment-000002": "frame 3 cannot be decoded"}
-    assert said == ["b/segment-000002 failed: frame 3 cannot be decoded"]
+    assert capsys.readouterr().err == "warp_ar: b/segment-000002 failed: frame 3 cannot be decoded\n"
     assert "b/join" not in given
     assert {"a/join", "c/join"} <= set(given)
     # It stays failed until it is asked for again.
@@ -100,7 +97,7 @@ def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path):
 
 
 def test_a_second_try_may_succeed(jobs, tmp_path):
-    pool, failed, _ = drive(
+    pool, failed = drive(
         jobs,
         tmp_path / "run",
         lambda job, before: Outcome("failed", reason="once") if job.kind == "join" and not before else None,
@@ -112,7 +109,7 @@ def test_a_second_try_may_succeed(jobs, tmp_path):
 def test_a_job_whose_workers_always_die_fails_alone(jobs, tmp_path):
     killed = Job("segment", 0, 1, 2, 4)
     lost = Outcome("lost", reason="its worker died")
-    pool, failed, _ = drive(jobs, tmp_path / "run", lambda job, _: lost if job == killed else None)
+    pool, failed = drive(jobs, tmp_path / "run", lambda job, _: lost if job == killed else None)
     assert pool.given.count(killed) == 1, "the pool has given it again"
     assert failed == {"a/segment-000001": "its worker died"}
     assert {"b/join", "c/join"} <= set(keys(jobs, pool.given))
@@ -126,7 +123,7 @@ def test_outputs_without_a_line_are_taken_over(jobs, tmp_path):
     lost = [line for line in lines if any(f'"{key}"' in line for key in ("b/segment-000003", "b/join", "b/survey"))]
     (run / "manifest.jsonl").write_text("".join(f"{line}\n" for line in lines if line not in lost))
     (run / "b.mp4").unlink()
-    pool, _, _ = drive(jobs, run)
+    pool, _ = drive(jobs, run)
     assert keys(jobs, pool.given) == ["b/join"]
     done = {line["job"]: line for line in map(json.loads, (run / "manifest.jsonl").read_text().splitlines())}
     assert len(done) == len((run / "manifest.jsonl").read_text().splitlines()) == 21
@@ -139,7 +136,7 @@ def test_a_full_disk_ends_the_run_and_says_how_to_go_on(jobs, tmp_path):
         drive(
             jobs, tmp_path / "run", lambda job, _: Outcome("full", reason="no room") if job.kind == "segment" else None
         )
-    pool, failed, _ = drive(jobs, tmp_path / "run")
+    pool, failed = drive(jobs, tmp_path / "run")
     assert not failed
     assert len([key for key in keys(jobs, pool.given) if "segment" in key]) == 15
 
@@ -150,7 +147,7 @@ def test_an_output_that_is_not_whole_is_made_again(jobs, tmp_path):
     drive(jobs, run)
     (run / "b.mp4").write_text("")
     (run / "parts/b/000003/data").write_text("")
-    pool, failed, _ = drive(jobs, run)
+    pool, failed = drive(jobs, run)
     assert keys(jobs, pool.given) == ["b/segment-000003", "b/join"]
     assert not failed
     assert (run / "b.mp4").read_text() == (run / "parts/b/000003/data").read_text() == "x"
@@ -174,11 +171,7 @@ def test_a_file_that_is_another_one_now_is_refused_by_its_name(jobs, tmp_path):
             pools.append(self)
 
     def run():
-        manifest = Manifest(tmp_path, write=True)
-        try:
-            return Driver(jobs, tmp_path, manifest, Kept(jobs, tmp_path, behave), print).run()
-        finally:
-            manifest.close()
+        return Driver(jobs, tmp_path, Manifest(tmp_path), Kept(jobs, tmp_path, behave)).run()
 
     assert run() == {}
     clip.write_text("first")  # another time, the same bytes
@@ -191,26 +184,20 @@ def test_a_file_that_is_another_one_now_is_refused_by_its_name(jobs, tmp_path):
         run()
 
 
-def test_frames_beyond_the_end_are_told(tmp_path):
+def test_frames_beyond_the_end_are_told(tmp_path, capsys):
     jobs = make_jobs(tmp_path, [{"name": "a", "frames": [0, 100000]}])
-    _, failed, said = drive(jobs, tmp_path / "run")
+    _, failed = drive(jobs, tmp_path / "run")
     assert not failed
-    assert said == ["clip a: frames = [0, 100000], but it ends with frame 9"]
+    assert capsys.readouterr().err == "warp_ar: clip a: frames = [0, 100000], but it ends with frame 9\n"
 
 
 def test_variations_are_numbered_over_all_clips_and_indexed_once(tmp_path):
     section = {"variations": 4, "object": [{"shape": "sphere", "radius": 0.02}]}
     jobs = make_jobs(tmp_path, [{"name": "a"}, {"name": "b"}], dataset=section)
-    told = []
-
-    class Indexed(Workers):
-        def submit(self, worker, job, arguments):
-            told.append(arguments) if job.kind == "index" else None
-            return super().submit(worker, job, arguments)
-
-    manifest = Manifest(tmp_path, write=True)
-    Driver(jobs, tmp_path, manifest, Indexed(jobs, tmp_path), print).run()
-    assert told == [[f"dataset/train/{number:06d}" for number in range(8)]]
-    Driver(jobs, tmp_path, manifest, Indexed(jobs, tmp_path), print).run()
-    assert len(told) == 1
-    manifest.close()
+    for count in (1, 0):
+        pool = Workers(jobs, tmp_path)
+        manifest = Manifest(tmp_path)
+        Driver(jobs, tmp_path, manifest, pool).run()
+        assert pool.given.count(Job("index")) == count
+    done = [job.place(jobs).as_posix() for job in variations_of(jobs) if job.key(jobs) in manifest.done]
+    assert done == [f"dataset/train/{number:06d}" for number in range(8)]

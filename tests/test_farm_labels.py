@@ -14,6 +14,7 @@ from tests.farm_rig import SIZE, make_jobs, write_recording
 from tests.kernel_rig import camera_fields, look_at, records
 from warp_ar.farm.jobs import Context, Job
 from warp_ar.farm.labels import DEPTH_SCALE
+from warp_ar.farm.manifest import Manifest
 from warp_ar.farm.work import Work
 from warp_ar.kernels.picture.object_masks import trace_object_masks
 from warp_ar.kernels.structs import FrameParams
@@ -48,13 +49,14 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("labels")
     write_recording(folder / "a.mp4", 5)
     jobs = make_jobs(folder, [{"scene": "desk", "path": "a.mp4"}], dataset=DATASET)
-    work = Work(Context(jobs, folder / "run", "cpu"))
+    work, manifest = Work(Context(jobs, folder / "run", "cpu")), Manifest(folder / "run")
     todo = [Job("survey"), Job("variation", 0, 0, 0, 5), Job("variation", 0, 1, 0, 5)]
     for job in todo:
         outcome = work.do(job)
         assert outcome.state == "done", outcome.reason
+        manifest.add("done", job.key(jobs))
     assert outcome.values["frames"] == 3
-    outcome = work.do(Job("index"), [job.place(jobs).as_posix() for job in todo[1:]])
+    outcome = work.do(Job("index"))
     assert outcome.state == "done", outcome.reason
     work.close()
     return folder / "run/dataset"

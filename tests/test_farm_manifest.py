@@ -9,8 +9,12 @@ import sys
 
 import pytest
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 from warp_ar.errors import UsageError
-from warp_ar.farm import manifest as manifests
 from warp_ar.farm.manifest import (
     Manifest,
     RunError,
@@ -23,35 +27,28 @@ from warp_ar.farm.manifest import (
 )
 
 
-def opened(folder):
-    return Manifest(folder, write=True)
-
-
 def test_lines_say_what_is_done_failed_and_tried(tmp_path):
-    first = opened(tmp_path)
+    first = Manifest(tmp_path)
     first.add("done", "a/survey", length=12)
     first.add("try", "a/segment-000000", reason="why")
     first.add("try", "a/segment-000000", reason="why")
     first.add("failed", "a/segment-000000", reason="why")
     first.add("done", "a/segment-000001", frames=3, bytes=7)
     first.add("again", "a/segment-000001", reason="gone")
-    first.close()
-    second = Manifest(tmp_path, write=False)
+    second = Manifest(tmp_path)
     assert second.done == {"a/survey": {"length": 12}}
     assert second.failed == {"a/segment-000000": "why"}
     assert second.tries == {"a/segment-000000": 2}
 
 
 def test_a_line_that_was_cut_off_is_cut_away(tmp_path):
-    first = opened(tmp_path)
+    first = Manifest(tmp_path)
     first.add("done", "a/survey", length=12)
-    first.close()
     with open(first.path, "ab") as stream:
         stream.write(b'{"state": "done", "job": "a/segm')
-    assert list(Manifest(tmp_path, write=False).done) == ["a/survey"]
-    second = opened(tmp_path)
+    assert list(Manifest(tmp_path).done) == ["a/survey"]
+    second = Manifest(tmp_path)
     second.add("done", "b/survey", length=1)
-    second.close()
     lines = first.path.read_text().splitlines()
     assert [json.loads(line)["job"] for line in lines] == ["a/survey", "b/survey"]
 
@@ -59,7 +56,7 @@ def test_a_line_that_was_cut_off_is_cut_away(tmp_path):
 def test_a_damaged_line_is_told_by_its_number(tmp_path):
     (tmp_path / "manifest.jsonl").write_text('{"state": "done", "job": "a/survey"}\nnonsense\n')
     with pytest.raises(RunError, match=r"manifest\.jsonl: line 2 is damaged"):
-        opened(tmp_path)
+        Manifest(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +75,7 @@ def test_a_damaged_line_is_told_by_its_number(tmp_path):
 def test_a_line_of_no_job_is_damaged(tmp_path, line):
     (tmp_path / "manifest.jsonl").write_text(line + "\n")
     with pytest.raises(RunError, match=r"manifest\.jsonl: line 1 is damaged \(.+\); remove the line and resume"):
-        opened(tmp_path)
+        Manifest(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, "[1]", '{"version": "1", "jobs": [1]}', '{"version": "1"}', "\xff"])
@@ -88,17 +85,20 @@ def test_a_run_that_is_none_is_one_line(tmp_path, text):
         load_run(tmp_path)
 
 
-def test_a_line_that_does_not_fit_the_disk_is_taken_back(tmp_path, monkeypatch):
-    manifest = opened(tmp_path)
+@pytest.mark.skipif(resource is None, reason="needs a limit of a file's size")
+def test_a_line_that_does_not_fit_the_disk_is_taken_back(tmp_path):
+    manifest = Manifest(tmp_path)
     manifest.add("done", "a/survey", length=12)
-    write = os.write
-    monkeypatch.setattr(manifests.os, "write", lambda file, data: write(file, data[:5]))
-    with pytest.raises(RunError, match=r"manifest\.jsonl cannot be written: No space left"):
-        manifest.add("done", "b/survey", length=12)
-    monkeypatch.undo()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (manifest.path.stat().st_size + 5, hard))
+    try:
+        with pytest.raises(RunError, match=r"manifest\.jsonl cannot be written: No space left"):
+            manifest.add("done", "b/survey", length=12)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(Manifest(tmp_path).done) == ["a/survey"]
     manifest.add("done", "c/survey", length=12)
-    manifest.close()
-    assert list(opened(tmp_path).done) == ["a/survey", "c/survey"]
+    assert list(Manifest(tmp_path).done) == ["a/survey", "c/survey"]
 
 
 def test_outputs_appear_whole_with_their_record(tmp_path):

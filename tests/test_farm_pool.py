@@ -52,7 +52,7 @@ def test_workers_see_no_interrupt_and_another_takes_the_place_of_one_that_dies(t
     pool = ProcessPool(Context(make_jobs(tmp_path, [{}]), tmp_path, "cpu"), ["cpu", "cpu"])
     job = Job("index")  # it fails at once: there is no data set
     try:
-        assert [pool.submit(worker, job, None).result(PATIENCE).state for worker in range(2)] == ["failed"] * 2
+        assert [pool.submit(worker, job).result(PATIENCE).state for worker in range(2)] == ["failed"] * 2
         mine = set(multiprocessing.active_children()) - others
         assert len(mine) == 2
         for process in mine:
@@ -61,7 +61,7 @@ def test_workers_see_no_interrupt_and_another_takes_the_place_of_one_that_dies(t
             assert held >> (signal.SIGINT - 1) & 1
             assert not held >> (signal.SIGTERM - 1) & 1
             process.kill()
-        assert pool.submit(0, job, None).result(PATIENCE).state == "failed"
+        assert pool.submit(0, job).result(PATIENCE).state == "failed"
     finally:
         pool.close()
     assert set(multiprocessing.active_children()) <= others
@@ -74,7 +74,7 @@ def test_a_worker_that_always_dies_is_told(tmp_path, monkeypatch, begins, told):
     monkeypatch.setattr(pools, "_do", _die)
     pool = ProcessPool(Context(make_jobs(tmp_path, [{}]), tmp_path, "cpu"), ["cpu"])
     try:
-        future = pool.submit(0, Job("survey"), None)
+        future = pool.submit(0, Job("survey"))
         found = future.result(PATIENCE).reason if begins else str(future.exception(PATIENCE))
         assert told in found
         assert str(tmp_path / "log/worker-0.log") in found

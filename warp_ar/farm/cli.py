@@ -16,7 +16,6 @@ from warp_ar.farm.manifest import (
     Manifest,
     RunError,
     begin_run,
-    clear_aside,
     load_run,
     locked,
     read_status,
@@ -107,17 +106,12 @@ def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], 
         )
     jobs = parse_jobs(data, str(folder / "run.json"))
     with locked(folder):
-        clear_aside(folder)
-        manifest = Manifest(folder, write=True)
-        try:
-            if getattr(options, "failed", False):
-                for key in list(manifest.failed):
-                    manifest.add("again", key, reason="resumed with --failed")
-            pool = employ(Context(jobs, folder.absolute(), "cpu"))
-            failed = Driver(jobs, folder, manifest, pool, say).run()
-        finally:
-            manifest.close()
-            clear_aside(folder)  # workers that were killed have left temporary files
+        manifest = Manifest(folder)
+        if getattr(options, "failed", False):
+            for key in list(manifest.failed):
+                manifest.add("again", key, reason="resumed with --failed")
+        pool = employ(Context(jobs, folder.absolute(), "cpu"))
+        failed = Driver(jobs, folder, manifest, pool).run()
     return _tell(folder, failed)
 
 

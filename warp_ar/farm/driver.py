@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import collections
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from pathlib import Path
-from typing import Any
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, say
 from warp_ar.farm.dataset import in_kindred_order
 from warp_ar.farm.jobs import Job, JobFile, Outcome, job_of_clip, jobs_of_clip
 from warp_ar.farm.manifest import Manifest, RunError, bytes_of, changed_input, record_at
@@ -27,14 +26,7 @@ LIGHTING = ("segment", "variation")
 class Driver:
     """Driver of a run, which has its jobs done by a pool of workers."""
 
-    def __init__(
-        self,
-        jobs: JobFile,
-        folder: Path,
-        manifest: Manifest,
-        pool: Pool,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, jobs: JobFile, folder: Path, manifest: Manifest, pool: Pool) -> None:
         """Prepare the run; jobs that are done already are found when their turn comes.
 
         Args:
@@ -42,18 +34,14 @@ class Driver:
             folder: Folder of the run.
             manifest: Manifest of the run, open for writing.
             pool: Workers.
-            say: Function to which lines about problems are passed.
         """
-        self._jobs, self._folder, self._manifest, self._pool, self._say = jobs, folder, manifest, pool, say
+        self._jobs, self._folder, self._manifest, self._pool = jobs, folder, manifest, pool
         self._again: collections.deque[Job] = collections.deque()
         self._open: dict[int, int] = {}
-        """Number of open jobs of each surveyed clip."""
-        self._spent: set[int] = set()
-        """Clips with a job that has failed for good; they are not joined."""
+        """Number of jobs of each surveyed clip that are not done; a clip with a failed job is never joined."""
         self._coming = self._list_jobs()
         self._surveyed: collections.deque[Iterator[Job]] = collections.deque()
         self._joins: collections.deque[Job] = collections.deque()
-        self._finished_now = 0
 
     def _list_jobs(self) -> Iterator[Job]:
         """Yield the surveys that are still to be done; open the jobs of clips that are surveyed already."""
@@ -111,7 +99,7 @@ class Driver:
         length = int(self._manifest.done[Job("survey", clip).key(self._jobs)]["length"])
         spec = self._jobs.clips[clip]
         if spec.end is not None and spec.end > length:
-            self._say(f"clip {spec.name}: frames = [{spec.first}, {spec.end}], but it ends with frame {length - 1}")
+            say(f"clip {spec.name}: frames = [{spec.first}, {spec.end}], but it ends with frame {length - 1}")
         count = jobs_of_clip(self._jobs, clip, length)
         self._open[clip] = count
         self._surveyed.append(self._jobs_of(clip, count, length))
@@ -121,21 +109,18 @@ class Driver:
         for number in range(count) if dataset is None else in_kindred_order(dataset, clip, count):
             job = job_of_clip(self._jobs, clip, number, length)
             if job.key(self._jobs) in self._manifest.failed:
-                self._settle(clip, failed=True)
-            elif self._is_done(job):
-                self._settle(clip, failed=False)
+                continue
+            if self._is_done(job):
+                self._settle(clip)
             else:
                 yield job
 
-    def _settle(self, clip: int, *, failed: bool) -> None:
-        """Count one of a clip's jobs as done or failed; after the last segment of a recording, plan to join them."""
+    def _settle(self, clip: int) -> None:
+        """Count one of a clip's jobs as done; after the last segment of a recording, plan to join them."""
         self._open[clip] -= 1
-        if failed:
-            self._spent.add(clip)
-        if not self._open[clip] and self._jobs.dataset is None and clip not in self._spent:
-            join = Job("join", clip)
-            if join.key(self._jobs) not in self._manifest.failed:
-                self._joins.append(join)
+        join = Job("join", clip)
+        if not self._open[clip] and self._jobs.dataset is None and join.key(self._jobs) not in self._manifest.failed:
+            self._joins.append(join)
 
     def _next_job(self) -> Job | None:
         """Return the next job to submit; None if none can begin now."""
@@ -161,45 +146,22 @@ class Driver:
             UsageError: A file has changed since it was read.
         """
         try:
-            self._work(self._next_job)
-            if self._jobs.dataset is not None:
-                self._index()
+            self._work()
+            if self._jobs.dataset is not None and not self._is_done(Job("index")):
+                self._joins.append(Job("index"))
+                self._work()
         finally:
             self._pool.close()
         return dict(self._manifest.failed)
 
-    def _index(self) -> None:
-        """Have the common files of a data set written, unless they are complete and no variation was added."""
-        done = [job for clip in sorted(self._open) for job in self._finished_jobs(clip)]
-        if not done or (not self._finished_now and self._is_done(Job("index"))):
-            return
-        key = Job("index").key(self._jobs)
-        if key in self._manifest.done:
-            self._manifest.add("again", key, reason="variations were added")
-        left = [Job("index")]
-        arguments = [job.place(self._jobs).as_posix() for job in done]
-        self._work(lambda: self._again.popleft() if self._again else left.pop() if left else None, arguments)
-
-    def _finished_jobs(self, clip: int) -> Iterator[Job]:
-        length = int(self._manifest.done[Job("survey", clip).key(self._jobs)]["length"])
-        for number in range(jobs_of_clip(self._jobs, clip, length)):
-            job = job_of_clip(self._jobs, clip, number, length)
-            if job.key(self._jobs) in self._manifest.done:
-                yield job
-
-    def _work(self, next_job: Callable[[], Job | None], arguments: Any = None) -> None:
-        """Submit jobs to idle workers and record their outcomes, until no job is left or running.
-
-        Args:
-            next_job: Function that returns the next job, or None if none can begin now.
-            arguments: Further data for the workers.
-        """
+    def _work(self) -> None:
+        """Submit jobs to idle workers and record their outcomes, until no job is left or running."""
         running: dict[Future[Outcome], tuple[int, Job]] = {}
         idle = collections.deque(range(self._pool.size))
         while True:
-            while idle and (job := next_job()) is not None:
+            while idle and (job := self._next_job()) is not None:
                 worker = idle.popleft()
-                running[self._pool.submit(worker, job, arguments)] = worker, job
+                running[self._pool.submit(worker, job)] = worker, job
             if not running:
                 return
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -227,13 +189,12 @@ class Driver:
                 return
         if outcome.state != "done":
             self._manifest.add("failed", key, reason=outcome.reason)
-            self._say(f"{key} failed: {outcome.reason}")
-            if job.kind in LIGHTING:
-                self._settle(job.clip, failed=True)
+            say(f"{key} failed: {outcome.reason}")
             return
         self._manifest.add("done", key, **outcome.values)
         if job.kind == "survey":
             self._open_clip(job.clip)
         elif job.kind in LIGHTING:
-            self._finished_now += 1
-            self._settle(job.clip, failed=False)
+            self._settle(job.clip)
+            if (index := Job("index").key(self._jobs)) in self._manifest.done:
+                self._manifest.add("again", index, reason="variations were added")

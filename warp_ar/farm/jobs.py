@@ -13,7 +13,9 @@ import functools
 import glob
 import hashlib
 import importlib.metadata
+import itertools
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +168,13 @@ def job_of_clip(jobs: JobFile, clip: int, number: int, length: int) -> Job:
     size = jobs.settings.segment_frames or end - first
     start = first + number * size
     return Job("segment", clip, number, start, min(start + size, end))
+
+
+def variations_of(jobs: JobFile) -> Iterator[Job]:
+    """Yield the variations of all clips of a data set, in order."""
+    assert jobs.dataset is not None
+    for clip, number in itertools.product(range(len(jobs.clips)), range(jobs.dataset.variations)):
+        yield Job("variation", clip, number)
 
 
 def lit_range(clip: Clip, length: int) -> tuple[int, int]:

@@ -48,12 +48,8 @@ class RunError(WarpArError):
 class Manifest:
     """Manifest of a run: its file, and the states of the jobs."""
 
-    def __init__(self, folder: Path, *, write: bool) -> None:
-        """Read the existing lines.
-
-        Args:
-            folder: Folder of the run.
-            write: True to add lines, and to remove an incomplete last line.
+    def __init__(self, folder: Path) -> None:
+        """Read the existing lines of the run in a folder.
 
         Raises:
             RunError: The manifest cannot be read, or a line before the last is damaged.
@@ -65,27 +61,15 @@ class Manifest:
         """Reasons of jobs that have failed for good."""
         self.tries: dict[str, int] = {}
         """Number of failed attempts of jobs that are neither done nor failed."""
-        self._file = -1
         data = _kept(self.path) or b""
-        whole = data[: data.rfind(b"\n") + 1]
-        for number, line in enumerate(whole.splitlines(), 1):
+        self._size = data.rfind(b"\n") + 1
+        for number, line in enumerate(data[: self._size].splitlines(), 1):
             try:
                 self._take(parse_line(line))
-            except ValueError as error:
+            except (ValueError, RunError) as error:
                 raise RunError(
                     f"{self.path}: line {number} is damaged ({reason(error)}); remove the line and resume"
                 ) from error
-        if write:
-            self._open(len(whole))
-
-    def _open(self, size: int) -> None:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-        try:
-            self._file = os.open(self.path, flags, 0o666)
-            os.ftruncate(self._file, size)
-        except OSError as error:
-            raise RunError(f"{self.path} cannot be written: {reason(error)}") from error
-        self._size = size
 
     def _take(self, line: dict[str, Any]) -> None:
         key = line["job"]
@@ -103,7 +87,7 @@ class Manifest:
                 self.done.pop(key, None)
 
     def add(self, state: str, key: str, **values: Any) -> None:
-        """Append a line.
+        """Append a line, after removing an incomplete one.
 
         Args:
             state: ``done``, ``failed`` (for good), ``try`` (an attempt has failed) or ``again`` (the job is repeated).
@@ -111,39 +95,30 @@ class Manifest:
             values: Further values of the line.
 
         Raises:
-            RunError: The line cannot be written; the file is unchanged.
+            RunError: The line cannot be written; no complete line is lost.
         """
         line = {"state": state, "job": key, **values}
         data = (json.dumps(line) + "\n").encode()
         try:
-            written = os.write(self._file, data)
-            if written < len(data):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            os.fsync(self._file)
+            with open(self.path, "ab", buffering=0) as file:
+                file.truncate(self._size)
+                if file.write(data) < len(data):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                os.fsync(file.fileno())
         except OSError as error:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._file, self._size)
             raise RunError(f"{self.path} cannot be written: {reason(error)}") from error
         self._size += len(data)
         self._take(line)
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
 
 
 def parse_line(line: bytes) -> dict[str, Any]:
     """Return a line of a manifest as data.
 
     Raises:
-        ValueError: The line is not valid.
+        RunError: The line is not JSON.
+        ValueError: The line is of no job.
     """
-    try:
-        told = json.loads(line)
-    except RecursionError as error:
-        raise ValueError("nested too deeply") from error
+    told = parse_json(line.decode(), "it", RunError)
     if not isinstance(told, dict) or not isinstance(told.get("job"), str) or "/" not in told["job"]:
         raise ValueError("no line of a job")
     if told.get("state") not in ("done", "failed", "try", "again"):
@@ -168,17 +143,9 @@ def _kept(path: Path) -> bytes | None:
         raise RunError(f"{path} cannot be read: {reason(error)}") from error
 
 
-def read_kept(path: Path) -> dict[str, Any] | None:
-    """Return the JSON object in one of a run's own files; None if it does not exist or is damaged."""
-    with contextlib.suppress(RunError, ValueError):
-        told = parse_json((_kept(path) or b"").decode(), str(path), RunError)
-        return told if isinstance(told, dict) else None
-    return None
-
-
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Context in which this process holds the lock of a run.
+    """Context in which this process holds the lock of a run; incomplete outputs of dead workers are removed.
 
     Raises:
         RunError: Another driver holds the lock, or the folder's disk has no locks.
@@ -193,8 +160,10 @@ def locked(folder: Path) -> Iterator[None]:
             f"{folder / LOCK} cannot be locked: {reason(error)}; a run needs a folder on a disk that can"
         ) from error
     try:
+        _clear_aside(folder)
         yield
     finally:
+        _clear_aside(folder)
         lock.release()
 
 
@@ -260,8 +229,7 @@ def load_run(folder: Path) -> tuple[dict[str, Any], str]:
     return jobs, str(data["version"])
 
 
-def clear_aside(folder: Path) -> None:
-    """Remove incomplete outputs of workers that died."""
+def _clear_aside(folder: Path) -> None:
     shutil.rmtree(folder / ASIDE, ignore_errors=True)
 
 
@@ -281,7 +249,7 @@ def aside(folder: Path, token: str) -> Iterator[Path]:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def publish(part: Path, place: Path, key: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Move a folder of outputs to its final path.
 
     If outputs of another worker for this job are there already, they stay, because they are equal.
@@ -303,7 +271,7 @@ def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None 
             digest.update(hashlib.file_digest(stream, "sha256").digest())
             os.fsync(stream.fileno())
         size += path.stat().st_size
-    told = {**(values or {}), "job": key, "bytes": size, "sha256": digest.hexdigest()}
+    told = {**values, "job": key, "bytes": size, "sha256": digest.hexdigest()}
     (part / RECORD).write_text(json.dumps(told), encoding="utf-8")
     place.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -315,13 +283,21 @@ def publish(part: Path, place: Path, key: str, values: Mapping[str, Any] | None 
     return told
 
 
-def publish_file(part: Path, place: Path) -> None:
-    """Move one file to its place, replacing an existing file."""
-    with open(part, "r+b") as stream:
-        os.fsync(stream.fileno())
+def publish_files(part: Path, place: Path) -> int:
+    """Move the content of a folder to the folder of ``place``, which is moved last; return the size of ``place``.
+
+    Existing files and folders are replaced.
+    """
     place.parent.mkdir(parents=True, exist_ok=True)
-    take_name(part, place)
+    for path in sorted(part.iterdir(), key=lambda path: path.name == place.name):
+        if path.is_dir():
+            shutil.rmtree(place.with_name(path.name), ignore_errors=True)
+        else:
+            with open(path, "r+b") as stream:
+                os.fsync(stream.fileno())
+        take_name(path, place.with_name(path.name))
     _sync_folder(place.parent)
+    return place.stat().st_size
 
 
 def _sync_folder(path: Path) -> None:
@@ -335,8 +311,10 @@ def _sync_folder(path: Path) -> None:
 
 def record_at(place: Path, key: str) -> dict[str, Any] | None:
     """Return the record in a folder of outputs; None if it has none of the job with this key."""
-    told = read_kept(place / RECORD)
-    return told if told is not None and told.get("job") == key else None
+    with contextlib.suppress(RunError, ValueError):
+        told = parse_json((_kept(place / RECORD) or b"").decode(), str(place), RunError)
+        return told if isinstance(told, dict) and told.get("job") == key else None
+    return None
 
 
 def bytes_of(place: Path) -> int | None:
@@ -395,7 +373,7 @@ def read_status(folder: Path) -> dict[str, Any]:
         RunError: The run cannot be read.
     """
     data, version = load_run(folder)
-    manifest = Manifest(folder, write=False)
+    manifest = Manifest(folder)
     kinds = collections.Counter(_kind(key) for key in manifest.done)
     lit = [line for key, line in manifest.done.items() if _kind(key) in ("segment", "variation")]
     failed = sum(_kind(key) in ("segment", "variation") for key in manifest.failed)

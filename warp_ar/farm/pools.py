@@ -109,21 +109,20 @@ class Pool(ABC):
         multiprocessing.resource_tracker.ensure_running()
         self._threads = [ThreadPoolExecutor(1, "warp_ar-worker", initializer=_hold_interrupts) for _ in range(size)]
 
-    def submit(self, worker: int, job: Job, arguments: Any) -> Future[Outcome]:
+    def submit(self, worker: int, job: Job) -> Future[Outcome]:
         """Submit a job to an idle worker.
 
         Args:
             worker: Index of the worker.
             job: The job.
-            arguments: Further data for the job.
 
         Returns:
             Future of the outcome; it raises RunError if the run cannot go on.
         """
-        return self._threads[worker].submit(self._do, worker, job, arguments)
+        return self._threads[worker].submit(self._do, worker, job)
 
     @abstractmethod
-    def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
+    def _do(self, worker: int, job: Job) -> Outcome:
         """Have a job done by a worker and return its outcome; the state is ``lost`` if the worker dies repeatedly."""
 
     @abstractmethod
@@ -186,11 +185,11 @@ class ProcessPool(Pool):
                 break
         raise RunError(f"worker {worker} died {STARTS} times before it was ready; see {self._log(worker)}")
 
-    def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
+    def _do(self, worker: int, job: Job) -> Outcome:
         for _ in range(DEATHS):
             executor = self._ready(worker)
             try:
-                return executor.submit(_do, job, arguments).result()
+                return executor.submit(_do, job).result()
             except BrokenExecutor:
                 del self._executors[worker]
             if self._closed:
@@ -240,12 +239,12 @@ def _end_with_driver() -> None:
         os._exit(1)
 
 
-def _do(job: Job, arguments: Any) -> Outcome:
+def _do(job: Job) -> Outcome:
     """Do a job in this worker's process; a survey may use the cores of all workers, because others wait for it."""
     assert _worker is not None
     work, every = _worker
     with keeping_to(every if job.kind == "survey" else ()):
-        outcome: Outcome = work.do(job, arguments)
+        outcome: Outcome = work.do(job)
     return outcome
 
 
@@ -295,12 +294,12 @@ class RayPool(Pool):
             self._actors.append(actor.remote(dataclasses.replace(context, device=device, worker=worker)))
         return self
 
-    def _do(self, worker: int, job: Job, arguments: Any) -> Outcome:
+    def _do(self, worker: int, job: Job) -> Outcome:
         actor = self._actors[worker]
         try:
             if (version := self._ray.get(actor.version.remote())) != (mine := program_version()):
                 raise RunError(f"worker {worker} is {version}, the driver is {mine}; install one version on all")
-            outcome: Outcome = self._ray.get(actor.do.remote(job, arguments))
+            outcome: Outcome = self._ray.get(actor.do.remote(job))
         except self._ray.exceptions.RayError as error:
             return Outcome("lost", reason=f"its worker died, killed or crashed: {reason(error)}")
         return outcome

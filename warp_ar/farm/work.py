@@ -33,13 +33,13 @@ from warp_ar.farm.jobs import (
     program_version,
     scene_of,
     source_of,
+    variations_of,
 )
 from warp_ar.farm.labels import LAYERS, LabelWriter, write_dataset_files
 from warp_ar.farm.lighting import Lighter
-from warp_ar.farm.manifest import NO_SPACE, aside, publish, publish_file
+from warp_ar.farm.manifest import NO_SPACE, Manifest, aside, publish, publish_files
 from warp_ar.farm.survey import lit_scene, survey_clip
 from warp_ar.farm.video import join_parts, open_part_sink
-from warp_ar.files import take_name
 from warp_ar.scene import SourceSpec, dumps_scene
 
 PART = "frames.mp4"
@@ -70,19 +70,14 @@ class Work(Closing):
         """Return the version of the program."""
         return program_version()
 
-    def do(self, job: Job, arguments: Any = None) -> Outcome:
-        """Do a job; an error is returned in the outcome, not raised.
-
-        Args:
-            job: The job.
-            arguments: For a job of kind ``index``, the folders of the finished variations.
-        """
+    def do(self, job: Job) -> Outcome:
+        """Do a job; an error is returned in the outcome, not raised."""
         context = self.context
         key, start = job.key(context.jobs), time.perf_counter()
         log = context.folder / "log" / f"{key}.log"
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
-            values = self._do(job, arguments)
+            values = self._do(job)
         except Exception as error:  # any error fails only this job, and its reason is kept
             known = isinstance(error, WarpArError | NoPlace)
             told = str(error) if known else f"{type(error).__name__}: {reason(error)}"
@@ -99,7 +94,7 @@ class Work(Closing):
         timing = {"seconds": round(seconds, 3), "ended": round(time.time(), 3), "worker": context.worker}
         return Outcome("done", {**values, **timing})
 
-    def _do(self, job: Job, arguments: Any) -> dict[str, Any]:
+    def _do(self, job: Job) -> dict[str, Any]:
         context, jobs = self.context, self.context.jobs
         key, place = job.key(jobs), context.folder / job.place(jobs)
         with aside(context.folder, f"{key.replace('/', '.')}.{context.worker}") as part:
@@ -112,18 +107,14 @@ class Work(Closing):
                     values = self._light_variation(job, part)
                 case "join":
                     values = self._join(job, part / place.name)
-                    for name in (place.with_suffix(DIGESTS).name, place.name):
-                        if (part / name).is_file():
-                            publish_file(part / name, place.with_name(name))
+                    size = publish_files(part, place)
                     shutil.rmtree(context.folder / "parts" / jobs.clips[job.clip].name, ignore_errors=True)
-                    return {**values, "bytes": place.stat().st_size}
+                    return {**values, "bytes": size}
                 case _:
-                    found = [Path(name) for name in arguments]
+                    done = Manifest(context.folder).done
+                    found = [job.place(jobs) for job in variations_of(jobs) if job.key(jobs) in done]
                     values = write_dataset_files(jobs, found, part, context.folder, program_version())
-                    _replace_models(part / "models", place.parent / "models")
-                    for name in ("datasheet.md", place.name):
-                        publish_file(part / name, place.parent / name)
-                    return {**values, "bytes": place.stat().st_size}
+                    return {**values, "bytes": publish_files(part, place)}
             return {k: v for k, v in publish(part, place, key, values).items() if k != "job"}
 
     def _light_segment(self, job: Job, part: Path) -> dict[str, Any]:
@@ -203,12 +194,6 @@ def _free_bytes(folder: Path) -> int:
         return shutil.disk_usage(folder).free
     except OSError:
         return LEAST_FREE
-
-
-def _replace_models(part: Path, place: Path) -> None:
-    """Move a folder of models to its place, replacing an existing one."""
-    shutil.rmtree(place, ignore_errors=True)
-    take_name(part, place)
 
 
 def _note(log: Path, line: str, more: str = "") -> None:
