@@ -76,7 +76,7 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
             "dataset.region = [0.1, 0, 0, 1]: expected [x0, y0, x1, y1]",
         ),
         (
-            'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nfile = "no.ply"\n',
+            'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "mesh"\nfile = "no.ply"\n',
             'dataset.object[0].file = "no.ply"',
         ),
         (
@@ -90,7 +90,7 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
             'model = "wood": expected one of "phong"',
         ),
         (
-            f"schema = 1\n[[clip]]\n[dataset]\n{BALL}[[dataset.light]]\n",
+            f'schema = 1\n[[clip]]\n[dataset]\n{BALL}[[dataset.light]]\nkind = "spot"\n',
             "dataset.light[0].at is missing: expected 3 numbers",
         ),
         (

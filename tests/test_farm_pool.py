@@ -33,8 +33,8 @@ def test_cores_are_kept_to_for_a_while():
 @pytest.mark.parametrize(
     ("address", "words"),
     [
-        ("somewhere", "--ray somewhere: expected HOST:PORT"),
-        ("host:99999", "--ray host:99999: expected HOST:PORT"),
+        ("somewhere", "--ray somewhere: no cluster answers"),
+        ("127.0.0.1:99999", "--ray 127.0.0.1:99999: no cluster answers"),
         ("127.0.0.1:1", "--ray 127.0.0.1:1: no cluster answers"),
     ],
 )

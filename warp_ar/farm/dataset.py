@@ -47,10 +47,7 @@ class JobTable(Table):
         """Return the absolute path of a file or folder that is given relative to the job file; it need not exist."""
         if key not in self.data:
             return None
-        value = self.text(key)
-        if "\0" in value:
-            self.fail(key, "expected a path; this cannot be one")
-        return Path(self.folder / value).absolute()
+        return Path(self.folder / self.text(key)).absolute()
 
     def pair(self, key: str, default: tuple[int, int], *, low: int) -> tuple[int, int]:
         """Return two integers, the first no larger than the second."""
@@ -86,10 +83,6 @@ _OWN_KEYS = ("name", "turn", "rest", "weight")
 """Keys of an object that objects of a scene do not have."""
 _OBJECT_KEYS = ("shape", "file", "radius", "size", "major_radius", "minor_radius", "scale", "rotate", "material")
 _LIGHT_KEYS = ("kind", "weight", "intensity", "color", *Light.USES["spot"])
-_LIGHT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
-    "point": {"intensity": 1.0},
-    "spot": {"intensity": 1.0, "target": [0.0, 0.0, 0.0], "inner_angle": 15.0, "outer_angle": 8.0},
-}
 RESTS = ("upright", "any")
 """Orientations of objects: rotated about the vertical only, or in any way; the lowest point touches the receiver."""
 MOST = 64
@@ -252,14 +245,11 @@ def _entries(table: JobTable, key: str, keys: Sequence[str]) -> list[JobTable]:
 
 
 def _read_object(table: JobTable) -> ObjectSpec:
-    data = {"shape": "mesh", "material": {}, **{key: table.data[key] for key in _OBJECT_KEYS if key in table}}
-    material = data["material"]
-    if isinstance(material, dict):
-        data["material"] = {"model": "metallic_roughness", **material}
+    data = {key: table.data[key] for key in _OBJECT_KEYS if key in table}
     for key, value in data.items():
         if key != "material" and _is_span(value):
             table.fail(key, "expected one value: what is labelled alike has one size; make it two objects")
-    name = Path(data["file"]).stem if isinstance(data.get("file"), str) else f"{data['shape']}-{table.section[15:-1]}"
+    name = Path(str(data["file"])).stem if "file" in data else f"{data.get('shape')}-{table.section[15:-1]}"
     return ObjectSpec(
         **_entry(table, data),
         name=table.text("name", name),
@@ -269,11 +259,10 @@ def _read_object(table: JobTable) -> ObjectSpec:
 
 
 def _read_light(table: JobTable) -> Entry:
-    kind = table.choice("kind", _LIGHT_DEFAULTS, "spot")
+    table.choice("kind", ("point", "spot"))
     if "at" not in table:
         table.fail("at", "expected 3 numbers in metres, or [lowest, highest] of them")
-    given = {key: value for key, value in table.data.items() if key != "weight"}
-    return Entry(**_entry(table, {**_LIGHT_DEFAULTS[kind], **given, "kind": kind}))
+    return Entry(**_entry(table, {key: value for key, value in table.data.items() if key != "weight"}))
 
 
 def _entry(table: JobTable, data: Mapping[str, Any]) -> dict[str, Any]:

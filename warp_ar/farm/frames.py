@@ -72,10 +72,11 @@ class VideoPart(VideoFile):
             self._gpu = None
         return super()._open(**how)
 
-    def _decode(self) -> Generator[Frame, None, None]:
+    def _passes(self) -> Generator[Frame, None, None]:
+        """Yield the frames of one pass, with their indices in the whole video."""
         ticks, tick = self._index.ticks, self._index.tick
         if not self._index.seekable or self._first == 0:
-            for frame in super()._decode():
+            for frame in self._decode():
                 if frame.index >= self._end:
                     return
                 if frame.index >= self._first:
@@ -101,10 +102,6 @@ class VideoPart(VideoFile):
                     return
         raise SourceError(f"{self._path} ends before frame {number}; its packets promise {self._end}")
 
-    def _passes(self) -> Generator[Frame, None, None]:
-        """Yield the frames of one pass, with their indices in the whole video."""
-        yield from self._decode()
-
     def _time_of(self, number: int) -> float:
         """Return the time in seconds of frame ``number`` since the first frame of the whole video.
 
@@ -125,10 +122,7 @@ class FolderPart(FrameFolder):
 
     def _passes(self) -> Generator[Frame, None, None]:
         """Yield the pictures of one pass, with their indices in the whole folder."""
-        yield from self._decode()
-
-    def _decode(self) -> Generator[Frame, None, None]:
-        for frame in super()._decode():
+        for frame in self._decode():
             number = frame.index + self._first
             yield dataclasses.replace(frame, index=number, time=number / self.fps)
 

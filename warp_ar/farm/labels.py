@@ -11,7 +11,8 @@ from __future__ import annotations
 import collections
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ import warp as wp
 
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SinkError, reason
 from warp_ar.farm.dataset import Dataset, ObjectSpec
 from warp_ar.farm.jobs import JobFile
 from warp_ar.farm.lighting import Lit
@@ -77,7 +77,6 @@ class LabelWriter(ThreadedSink):
         self._images: list[dict[str, Any]] = []
         self._annotations: list[dict[str, Any]] = []
         self._masks: Any = None
-        self._light: tuple[int | None, list[list[float]] | None] | None = None
         for name in ("rgb", "depth", "normals", "mask", "mask_visib"):
             (folder / name).mkdir()
 
@@ -172,13 +171,10 @@ class LabelWriter(ThreadedSink):
 
     def _note_light(self, lit: Lit, key: int | None) -> None:
         """Record the environment as nine spherical harmonics of radiance, and the frame's virtual lights."""
-        if self._light is None or self._light[0] != key:
-            environment = lit.pipeline.arrays.get("environment")
-            harmonics = None
-            if environment is not None:
-                with exclusive(lit.pipeline.device):
-                    harmonics = [_numbers(row) for row in project_radiance(environment.numpy())]
-            self._light = key, harmonics
+        environment, harmonics = lit.pipeline.arrays.get("environment"), None
+        if environment is not None:
+            with exclusive(lit.pipeline.device):
+                harmonics = [_numbers(row) for row in project_radiance(environment.numpy())]
         lights = []
         for light in self._scene.lights:
             position, direction = light.pose_at(lit.frame.time)
@@ -196,7 +192,7 @@ class LabelWriter(ThreadedSink):
             )
         self._tables["light"][str(lit.frame.index)] = {
             "environment_key": key,
-            "environment_harmonics": self._light[1],
+            "environment_harmonics": harmonics,
             "exposure_scale": self._scene.exposure.scale,
             "lights": lights,
         }
@@ -289,45 +285,32 @@ def write_dataset_files(jobs: JobFile, places: Sequence[Path], folder: Path, run
 
     Returns:
         Numbers of pictures and labels of the data set.
-
-    Raises:
-        SinkError: A file cannot be written.
     """
     dataset = jobs.dataset
     assert dataset is not None
-    try:
-        _write_models(dataset.catalogue, folder / "models")
-        counts = _write_coco(dataset, places, folder / "annotations.json", run)
-        sheet = _datasheet(jobs, dataset, places, counts, version)
-        (folder / "datasheet.md").write_text(sheet, encoding="utf-8")
-    except OSError as error:
-        raise SinkError(f"{folder} cannot be written: {reason(error)}") from error
+    _write_models(dataset.catalogue, folder / "models")
+    counts = _write_coco(dataset, places, folder / "annotations.json", run)
+    sheet = _datasheet(jobs, dataset, places, counts, version)
+    (folder / "datasheet.md").write_text(sheet, encoding="utf-8")
     return {"pictures": counts["pictures"], "labels": counts["labels"]}
-
-
-def _model(spec: ObjectSpec) -> Any:
-    """Return the scaled triangles of an object in millimetres, in the object's frame."""
-    import trimesh  # imported here, because no other job needs it
-
-    made = mesh_of(spec.item)
-    vertices = 1e3 * spec.item.scale * made.vertices
-    return trimesh.Trimesh(vertices, made.faces, vertex_normals=made.normals, process=False)
 
 
 def _write_models(catalogue: Sequence[ObjectSpec], folder: Path) -> None:
     """Write one PLY file for each kind of object, and the sizes of all in BOP's form."""
+    import trimesh  # imported here, because no other job needs it
+
     folder.mkdir()
     table = {}
+    names = ("min_x", "min_y", "min_z", "size_x", "size_y", "size_z")
     for number, spec in enumerate(catalogue, 1):
-        mesh = _model(spec)
+        made = mesh_of(spec.item)
+        vertices = 1e3 * spec.item.scale * made.vertices
+        mesh = trimesh.Trimesh(vertices, made.faces, vertex_normals=made.normals, process=False)
         (folder / f"obj_{number:06d}.ply").write_bytes(mesh.export(file_type="ply", vertex_normal=True))
-        low, high = np.asarray(mesh.bounds)
-        x, y, z = (round(float(v), 6) for v in low)
-        a, b, c = (round(float(v), 6) for v in high - low)
+        low, high = mesh.bounds
         table[str(number)] = {
             "diameter": _diameter(np.asarray(mesh.vertices)),
-            **dict(zip(("min_x", "min_y", "min_z"), (x, y, z), strict=True)),
-            **dict(zip(("size_x", "size_y", "size_z"), (a, b, c), strict=True)),
+            **dict(zip(names, np.round([*low, *(high - low)], 6).tolist(), strict=True)),
             "name": spec.name,
         }
     (folder / "models_info.json").write_text(json.dumps(table, indent=1), encoding="utf-8")
@@ -343,11 +326,6 @@ def _diameter(vertices: Any) -> float:
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(golden), np.sqrt(1 - z * z) * np.sin(golden), z])
     kept = vertices[np.unique(np.concatenate([np.argmax(vertices @ part, 0) for part in np.split(directions, 8, 1)]))]
     return round(float(max(np.linalg.norm(kept - point, axis=1).max() for point in kept)), 6)
-
-
-def _variations(places: Sequence[Path], run: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    for place in places:
-        yield place, json.loads((run / place / "scene_gt_coco.json").read_text(encoding="utf-8"))
 
 
 def _write_coco(dataset: Dataset, places: Sequence[Path], path: Path, run: Path) -> collections.Counter[str]:
@@ -366,7 +344,8 @@ def _write_coco(dataset: Dataset, places: Sequence[Path], path: Path, run: Path)
     annotations = path.with_suffix(".part")
     with open(path, "w", encoding="utf-8") as images, open(annotations, "w+", encoding="utf-8") as labels:
         images.write('{"categories": ' + json.dumps(categories(dataset.catalogue)) + ',\n"images": [')
-        for place, table in _variations(places, run):
+        for place in places:
+            table = json.loads((run / place / "scene_gt_coco.json").read_text(encoding="utf-8"))
             first = counts["pictures"]
             ids = {image["id"]: first + n for n, image in enumerate(table["images"], 1)}
             for image in table["images"]:
@@ -381,17 +360,30 @@ def _write_coco(dataset: Dataset, places: Sequence[Path], path: Path, run: Path)
                 counts[f"category {label['category_id']}"] += 1
         images.write('],\n"annotations": [')
         labels.seek(0)
-        while part := labels.read(1 << 20):
-            images.write(part)
+        shutil.copyfileobj(labels, images)
         images.write("]}\n")
     annotations.unlink()
     return counts
 
 
-_SHEET = """# Datasheet
+def _datasheet(
+    jobs: JobFile, dataset: Dataset, places: Sequence[Path], counts: collections.Counter[str], version: str
+) -> str:
+    """Return the text of the datasheet: contents, origin and limits of the data set."""
+    categories = "\n".join(
+        f"| {number} | {spec.name} | {spec.item.shape} | {counts[f'category {number}']} |"
+        for number, spec in enumerate(dataset.catalogue, 1)
+    )
+    clips = [f"- `{clip.name}`: scene `{Path(clip.scene).name}`" for clip in jobs.clips[:_LISTED]]
+    if len(jobs.clips) > _LISTED:
+        clips.append(f"- and {len(jobs.clips) - _LISTED} more")
+    recordings = "\n".join(clips)
+    return f"""# Datasheet
 
-{pictures} pictures with {labels} visible objects, in {made} of {planned} planned variations of {clips} clips. Made by
-{version}, quality `{quality}`, seed {seed}: the same job file gives the same bytes on any number of workers.
+{counts["pictures"]} pictures with {counts["labels"]} visible objects,
+in {len(places)} of {len(jobs.clips) * dataset.variations} planned variations of {len(jobs.clips)} clips.
+Made by {version}, quality `{jobs.settings.quality}`, seed {dataset.seed}: the same job file gives the same bytes on any
+number of workers.
 
 ## Composition
 
@@ -402,13 +394,14 @@ and by virtual lights. Labels come from the geometry that was rendered; nobody d
 | --- | --- | --- | --: |
 {categories}
 
-{objects[0]} to {objects[1]} objects and {lights[0]} to {lights[1]} virtual lights in a picture; exposure {low:g} to
-{high:g}. Objects stand {margin:g} m apart at least and hide the marker from no camera of the clip.
+{dataset.objects[0]} to {dataset.objects[1]} objects and {dataset.lights[0]} to {dataset.lights[1]} virtual lights in a
+picture; exposure {dataset.exposure[0]:g} to {dataset.exposure[1]:g}.
+Objects stand {dataset.margin:g} m apart at least and hide the marker from no camera of the clip.
 
 ## Files
 
 - `train/NNNNNN/`: a variation as a BOP scene; `scene.toml` draws it again
-- `depth`: 16-bit PNG, {step:g} mm a step along the camera's axis; 0 where nothing is modelled
+- `depth`: 16-bit PNG, {DEPTH_SCALE:g} mm a step along the camera's axis; 0 where nothing is modelled
 - `normals`: 16-bit PNG, (n + 1) / 2 in the camera's axes (x right, y down, z forward); 0 where nothing is modelled
 - `mask`: the silhouette within the picture, whatever is before it; `mask_visib`: what is seen of it
 - `scene_light.json`: virtual lights in the world's metres, and the environment as nine spherical harmonics of its
@@ -428,34 +421,3 @@ and by virtual lights. Labels come from the geometry that was rendered; nobody d
 - An object that lies any way up touches the desk with its lowest point; whether it would tip over is not asked.
 - People and rooms of the recordings are in the pictures: whose consent they need is not asked here.
 """
-
-
-def _datasheet(
-    jobs: JobFile, dataset: Dataset, places: Sequence[Path], counts: collections.Counter[str], version: str
-) -> str:
-    """Return the text of the datasheet: contents, origin and limits of the data set."""
-    rows = (
-        f"| {number} | {spec.name} | {spec.item.shape} | {counts[f'category {number}']} |"
-        for number, spec in enumerate(dataset.catalogue, 1)
-    )
-    clips = [f"- `{clip.name}`: scene `{Path(clip.scene).name}`" for clip in jobs.clips[:_LISTED]]
-    if len(jobs.clips) > _LISTED:
-        clips.append(f"- and {len(jobs.clips) - _LISTED} more")
-    return _SHEET.format(
-        pictures=counts["pictures"],
-        labels=counts["labels"],
-        made=len(places),
-        planned=len(jobs.clips) * dataset.variations,
-        clips=len(jobs.clips),
-        version=version,
-        quality=jobs.settings.quality,
-        seed=dataset.seed,
-        categories="\n".join(rows),
-        objects=dataset.objects,
-        lights=dataset.lights,
-        low=dataset.exposure[0],
-        high=dataset.exposure[1],
-        margin=dataset.margin,
-        step=DEPTH_SCALE,
-        recordings="\n".join(clips),
-    )

@@ -6,6 +6,7 @@ import collections
 import contextlib
 import dataclasses
 import gc
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -88,7 +89,7 @@ class Lighter(Closing):
     def light(
         self, job: Job, scene: Scene | None = None, *, outputs: tuple[str, ...] = ("image",), every: int = 1
     ) -> Iterator[Lit]:
-        """Yield the lit frames of a job.
+        """Return the lit frames of a job.
 
         If only pictures are requested, a frame is yielded after the next one was begun, so that both overlap.
 
@@ -101,18 +102,13 @@ class Lighter(Closing):
         Raises:
             WarpArError: The recording or the scene cannot be used.
         """
-        light = self._light_alone if self._jobs.settings.light == "preroll" else self._light_surveyed
-        frames = light(job, scene, outputs, every)
+        if self._jobs.settings.light == "preroll":
+            frames = self._light_alone(job, outputs)
+        else:
+            frames = self._light_surveyed(job, scene, outputs, every)
         if outputs != ("image",):
-            yield from frames
-            return
-        before = next(frames, None)
-        for lit in frames:
-            assert before is not None
-            yield before
-            before = lit
-        if before is not None:
-            yield before
+            return frames
+        return (lit for lit, _ in itertools.pairwise(itertools.chain(frames, (None,))) if lit is not None)
 
     def _light_surveyed(self, job: Job, scene: Scene | None, outputs: tuple[str, ...], every: int) -> Iterator[Lit]:
         """Yield frames that are lit with the poses and the light of their clip's survey."""
@@ -135,28 +131,24 @@ class Lighter(Closing):
                     result = _call(pipeline)(frame.deepest, time_seconds=frame.time, pose=pose)
                 yield Lit(frame, pose, result, pipeline)
 
-    def _light_alone(self, job: Job, scene: Scene | None, outputs: tuple[str, ...], every: int) -> Iterator[Lit]:
+    def _light_alone(self, job: Job, outputs: tuple[str, ...]) -> Iterator[Lit]:
         """Yield the frames of a segment, lit by a pipeline that tracks the marker and captures the light itself.
 
         The pipeline begins ``preroll`` frames before the segment.
         """
-        own = scene_of(self._jobs, job.clip) if scene is None else scene
+        own = scene_of(self._jobs, job.clip)
         first, _ = lit_range(self._jobs.clips[job.clip], self.survey(job.clip).index.length)
         with (
             contextlib.closing(self._open(job, max(first, job.first - self._jobs.settings.preroll))) as source,
             Pipeline(
-                own,
-                linear=keep_depth(source, own),
-                size=source.size,
-                outputs=outputs,
-                **self._options(),
+                own, linear=keep_depth(source, own), size=source.size, outputs=outputs, **self._options()
             ) as pipeline,
         ):
             pipeline.start_clock(0.0)
             for frame in source:
                 pose = given_pose(own.pose, frame)
                 result = _call(pipeline)(frame.deepest, time_seconds=frame.time, pose=pose)
-                if frame.index >= job.first and not (frame.index - job.first) % every:
+                if frame.index >= job.first:
                     yield Lit(frame, None, result, pipeline)
 
     def _open(self, job: Job, first: int) -> RecordedSource:

@@ -38,8 +38,6 @@ DEATHS = 5
 """Number of deaths of its worker after which a job has failed."""
 STARTS = 3
 """Number of consecutive deaths of a starting worker after which the run ends."""
-CONNECT_SECONDS = 30.0
-"""Seconds within which a cluster must answer."""
 KNOCK_SECONDS = 5.0
 """Seconds within which a cluster's host must accept a connection."""
 
@@ -317,9 +315,7 @@ def share_of_gpu(workers: int, gpus: int) -> float:
 
 
 def _connect(ray: Any, address: str | None) -> None:
-    """Connect to a cluster within a limited time.
-
-    The host is tried first, because Ray takes half a minute to report that no cluster answers.
+    """Connect to a cluster; the host is tried first, because Ray takes half a minute to report that none answers.
 
     Raises:
         UsageError: No cluster answers at the address.
@@ -332,20 +328,11 @@ def _connect(ray: Any, address: str | None) -> None:
             ray.init(**options)
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
-        raise UsageError(f"--ray {address}: expected HOST:PORT, as `ray start --head` prints it")
-    future: Future[Any] = Future()
-
-    def connect() -> None:
-        try:
-            future.set_result(ray.init(address=address, **options))
-        except Exception as error:  # Ray raises any error of its transport
-            future.set_exception(error)
-
     try:
         socket.create_connection((host, int(port)), KNOCK_SECONDS).close()
-        threading.Thread(target=connect, name="warp_ar-ray", daemon=True).start()
-        future.result(CONNECT_SECONDS)
-    except Exception as error:
-        told = f"--ray {address}: no cluster answers ({reason(error)[:200]}); start one with: ray start --head"
-        raise UsageError(told) from error
+        ray.init(address=address, **options)
+    except Exception as error:  # Ray raises any error of its transport
+        raise UsageError(
+            f"--ray {address}: no cluster answers ({reason(error)[:200]}); expected HOST:PORT, as `ray start --head` "
+            "prints it"
+        ) from error

@@ -19,7 +19,7 @@ from typing import Any
 import av
 
 from warp_ar.errors import SinkError, SourceError, reason
-from warp_ar.output.encoders import Encoding, find_encoding
+from warp_ar.output.encoders import find_encoding
 from warp_ar.output.video_sink import VideoSink, tag_for_players
 from warp_ar.signature import PROGRAM
 
@@ -37,24 +37,10 @@ _LANGUAGES = ("language", "title", "handler_name")
 """Names of a stream's metadata that remain valid in another file."""
 
 
-def part_encoding(coding: str = "8bit") -> Encoding:
-    """Return the encoding of segments: H.264 for 8 bits, else H.265; its bytes are the same on every machine.
-
-    Args:
-        coding: One of ``CODINGS``.
-
-    Raises:
-        SinkError: The encoder is missing.
-    """
-    if coding == "8bit":
-        own = {"preset": "superfast", "threads": str(ENCODER_THREADS), "x264-params": _X264}
-    else:
-        own = {"x265-params": _X265}
-    return find_encoding(coding, options={"bf": "0", **own})
-
-
 def open_part_sink(path: Path, tick: fractions.Fraction, fps: float, coding: str, transfer: str) -> VideoSink:
     """Open a segment's video; frames are added by ``write_at``.
+
+    It is H.264 for 8 bits, else H.265; its bytes are the same on every machine.
 
     Args:
         path: The file.
@@ -66,7 +52,12 @@ def open_part_sink(path: Path, tick: fractions.Fraction, fps: float, coding: str
     Raises:
         SinkError: The encoder is missing.
     """
-    return VideoSink(path, fps=fps, encoding=part_encoding(coding), transfer=transfer, tick=tick)
+    if coding == "8bit":
+        own = {"preset": "superfast", "threads": str(ENCODER_THREADS), "x264-params": _X264}
+    else:
+        own = {"x265-params": _X265}
+    encoding = find_encoding(coding, options={"bf": "0", **own})
+    return VideoSink(path, fps=fps, encoding=encoding, transfer=transfer, tick=tick)
 
 
 def join_parts(
