@@ -64,7 +64,7 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
         ("schema = 1\n[[clip]]\nframes = [5, 2]\n", "clip[0].frames = [5, 2]: expected two whole numbers"),
         ('schema = 1\n[[clip]]\nname = "a/b"\n', 'clip[0].name = "a/b": expected letters'),
         ('schema = 1\n[run]\nquality = "best"\n[[clip]]\n', 'run.quality = "best": expected one of "paper", "low"'),
-        ("schema = 1\n[run]\ndigests = 1\n[[clip]]\n", "run.digests = 1: expected true or false"),
+        ("schema = 1\n[run]\ndigests = 1\n[[clip]]\n", "run.digests = 1: expected True or False"),
         (
             f"schema = 1\n[run]\ndigests = true\n[[clip]]\n[dataset]\n{BALL}",
             "run.digests: the manifest has a digest of",

@@ -154,7 +154,7 @@ CASES = {
         ("resume nowhere", "nowhere holds no run (run.json is missing); begin one with: farm run"),
         ("status nowhere", "nowhere holds no run"),
         ("run jobs.toml --output .", ". is not empty"),
-        ("run jobs.toml --output good.mp4", "--output good.mp4 is a file; name a new folder"),
+        ("run jobs.toml --output good.mp4", "--output good.mp4 is no folder; name a new one"),
         ("run jobs.toml", "the following arguments are required: --output"),
     ],
     "init": [

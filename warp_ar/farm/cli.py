@@ -9,7 +9,7 @@ from pathlib import Path
 
 from warp_ar.begin import importing
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, number, run_command
-from warp_ar.errors import UsageError, counted, printable, say
+from warp_ar.errors import UsageError, say
 from warp_ar.farm.driver import Driver
 from warp_ar.farm.jobs import Context, parse_jobs, program_version, read_jobs
 from warp_ar.farm.manifest import (
@@ -20,7 +20,6 @@ from warp_ar.farm.manifest import (
     locked,
     read_status,
     status_lines,
-    words_of_counts,
 )
 from warp_ar.farm.pools import Pool, ProcessPool, RayPool, devices_of
 
@@ -112,7 +111,8 @@ def work(options: argparse.Namespace, folder: Path, employ: Callable[[Context], 
                 manifest.add("again", key, reason="resumed with --failed")
         pool = employ(Context(jobs, folder.absolute(), "cpu"))
         failed = Driver(jobs, folder, manifest, pool).run()
-    return _tell(folder, failed)
+    print("\n".join(status_lines(folder, read_status(folder))))
+    return EXIT_FAILED if failed else EXIT_DONE
 
 
 def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
@@ -125,24 +125,6 @@ def _employer(options: argparse.Namespace) -> Callable[[Context], Pool]:
         devices = devices_of(options.device, options.workers)
         return lambda context: ProcessPool(context, devices)
     return RayPool(options.ray or None, options.workers).employ
-
-
-def _tell(folder: Path, failed: dict[str, str]) -> int:
-    """Print the outcome of a run and return the exit code.
-
-    Args:
-        folder: Folder of the run.
-        failed: Reasons of failed jobs, by their keys.
-    """
-    status = read_status(folder)
-    counts = words_of_counts(status["done"])
-    print(printable(f"{folder}: {counts or 'nothing'} done, {status['frames']} frames, {status['bytes'] / 1e6:.1f} MB"))
-    if not failed:
-        return EXIT_DONE
-    print(f"{counted(len(failed), 'job')} failed:")
-    for key, why in sorted(failed.items())[:50]:
-        print(printable(f"  {key}: {why}"))
-    return EXIT_FAILED
 
 
 def plan(options: argparse.Namespace) -> int:

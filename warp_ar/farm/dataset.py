@@ -15,7 +15,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ from trimesh.bounds import corners
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.output.shot import mesh_of
 from warp_ar.scene import Exposure, Light, Object, Pose, Proxy, Scene
-from warp_ar.scene.fields import fields_of
+from warp_ar.scene.fields import Key, fields_of
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.pixel_rays import project
 from warp_ar.scene.scene_files import SceneFiles
@@ -42,6 +42,11 @@ class JobTable(Table):
     """Table of a job file."""
 
     error = JobsError
+
+    def read(self, kind: Any, **given: Any) -> Any:
+        """Return the dataclass of the table; ``given`` are values of fields that are not declared keys."""
+        values = {name: self.admit(field) for name, field in fields_of(kind).items() if name in self}
+        return kind(**values, **given)
 
     def path(self, key: str) -> Path | None:
         """Return the absolute path of a file or folder that is given relative to the job file; it need not exist."""
@@ -159,23 +164,23 @@ class ObjectSpec(Entry):
         return self.draw(np.zeros)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Dataset:
     """The values of ``[dataset]``."""
 
-    variations: int
+    variations: Annotated[int, Key(low=1)] = 1
     """Number of variations of each clip."""
-    seed: int
+    seed: Annotated[int, Key(low=0, high=2**63 - 1)] = 0
     """Seed of the random numbers."""
     objects: tuple[int, int]
     """Least and largest number of objects in a picture."""
     lights: tuple[int, int]
     """Least and largest number of virtual lights."""
-    every: int
+    every: Annotated[int, Key(low=1)] = 1
     """Interval of written frames: 1 writes every frame."""
-    region: tuple[float, ...] | None
+    region: Annotated[tuple[float, ...] | None, Key(sizes=(4,), low=-100.0, high=100.0)] = None
     """Area for objects as x0, y0, x1, y1 in metres; None: the receiver within 0.25 m of the marker."""
-    margin: float
+    margin: Annotated[float, Key(low=0.0, high=10.0)] = 0.005
     """Least horizontal distance in metres of an object from other objects, modelled surfaces, balls and the card."""
     exposure: tuple[float, float]
     """Lowest and highest factor of the simulated exposure (``Exposure.scale``)."""
@@ -203,9 +208,6 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     if len({spec.name for spec in catalogue}) < len(catalogue):
         table.fail("object", "two have one name; each is a category of its own")
     kinds = tuple(map(_read_light, _entries(table, "light", _LIGHT_KEYS)))
-    region = table.vector("region", sizes=(4,), low=-100.0, high=100.0) if "region" in table else None
-    if region is not None and not (region[0] < region[2] and region[1] < region[3]):
-        table.fail("region", "expected [x0, y0, x1, y1] in metres with x0 < x1 and y0 < y1")
     lights = table.pair("lights", (1, 1) if kinds else (0, 0), low=0)
     objects = table.pair("objects", (1, 3), low=0)
     specs: Sequence[Entry]
@@ -222,18 +224,14 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
                 spec.draw(extreme)
     except SceneError as error:
         raise JobsError(str(error)) from error
-    return Dataset(
-        variations=table.integer("variations", 1, low=1),
-        seed=table.integer("seed", 0, low=0, high=2**63 - 1),
-        objects=objects,
-        lights=lights,
-        every=table.integer("every", 1, low=1),
-        region=region,
-        margin=table.number("margin", 0.005, low=0.0, high=10.0),
-        exposure=table.span("exposure", (1.0, 1.0), low=0.01, high=16.0),
-        catalogue=catalogue,
-        kinds_of_light=kinds,
+    exposure = table.span("exposure", (1.0, 1.0), low=0.01, high=16.0)
+    dataset: Dataset = table.read(
+        Dataset, objects=objects, lights=lights, exposure=exposure, catalogue=catalogue, kinds_of_light=kinds
     )
+    region = dataset.region
+    if region is not None and not (region[0] < region[2] and region[1] < region[3]):
+        table.fail("region", "expected [x0, y0, x1, y1] in metres with x0 < x1 and y0 < y1")
+    return dataset
 
 
 def _entries(table: JobTable, key: str, keys: Sequence[str]) -> list[JobTable]:

@@ -17,7 +17,7 @@ import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import warp_ar
 from warp_ar.errors import SceneError
@@ -25,18 +25,13 @@ from warp_ar.farm.dataset import Dataset, JobsError, JobTable, read_dataset
 from warp_ar.files import is_file, is_folder, parse_toml, read_text
 from warp_ar.output.encoders import CODINGS
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
+from warp_ar.scene.fields import Key, fields_of
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
 SCHEMA = 1
-LIGHTS = ("follow", "fixed", "preroll")
-"""Light of a clip whose scene has a mirror ball. ``follow``: as captured in each frame. ``fixed``: as captured at the
-clip's end. ``preroll``: each segment captures it anew, beginning some frames before the segment."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-DECODERS = ("cpu", "gpu")
-"""Decoders of recordings: the processor, or the GPU if it can decode their codec."""
 AS_RECORDED = "recorded"
 """Value of the key ``coding`` besides ``CODINGS``: the output has the bit depth of the source."""
-_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding", "digests")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
@@ -44,19 +39,23 @@ _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 class Settings:
     """Settings of all clips."""
 
-    quality: str = DEFAULT_PRESET
+    quality: Annotated[str, Key(words=tuple(PRESETS))] = DEFAULT_PRESET
     """Name of a quality preset."""
-    light: str = "follow"
-    """One of ``LIGHTS``."""
-    segment_frames: int | None = None
+    light: Annotated[str, Key(words=("follow", "fixed", "preroll"))] = "follow"
+    """Light of a clip whose scene has a mirror ball.
+
+    ``follow``: as captured in each frame. ``fixed``: as captured at the clip's end. ``preroll``: each segment captures
+    it anew, beginning some frames before the segment.
+    """
+    segment_frames: Annotated[int | None, Key(low=1)] = None
     """Number of frames of a segment; None: one segment per clip."""
-    preroll: int = 48
+    preroll: Annotated[int, Key(low=0)] = 48
     """Number of frames before a segment from which its light and tracking begin, with ``light = "preroll"``."""
-    decode: str = DECODERS[0]
-    """One of ``DECODERS``."""
-    coding: str = AS_RECORDED
+    decode: Annotated[str, Key(words=("cpu", "gpu"))] = "cpu"
+    """Decoder of recordings: the processor, or the GPU if it can decode their codec."""
+    coding: Annotated[str, Key(words=(AS_RECORDED, *CODINGS))] = AS_RECORDED
     """Coding of the output: one of ``CODINGS``, or ``AS_RECORDED``."""
-    digests: bool = False
+    digests: Annotated[bool, Key()] = False
     """True to write a digest of every lit picture, computed before encoding."""
 
     def gpu_of(self, device: str) -> int | None:
@@ -253,7 +252,7 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
     top = JobTable(label, folder, "", data, ("schema", "run", "clip", "dataset", "folder"))
     if data.get("schema") != SCHEMA:
         top.fail("schema", f"expected {SCHEMA}")
-    settings = _read_settings(JobTable(label, folder, "run", data.get("run", {}), _RUN_KEYS))
+    settings: Settings = JobTable(label, folder, "run", data.get("run", {}), list(fields_of(Settings))).read(Settings)
     names: dict[str, int] = {}
     clips = []
     for index, entry in enumerate(data["clip"]):
@@ -293,15 +292,6 @@ def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None
             f'{label}: clip {clip.name}: scene {clip.scene} says exposure.scale = "auto", which adapts from frame to '
             'frame; expected no run.segment_frames, run.light = "preroll", or a number as scale'
         )
-
-
-def _read_settings(table: JobTable) -> Settings:
-    quality = table.choice("quality", PRESETS, DEFAULT_PRESET)
-    size = table.integer("segment_frames", low=1) if "segment_frames" in table else None
-    light, decode = table.choice("light", LIGHTS, LIGHTS[0]), table.choice("decode", DECODERS, DECODERS[0])
-    coding = table.choice("coding", (AS_RECORDED, *CODINGS), AS_RECORDED)
-    digests = table.flag("digests", False)
-    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode, coding, digests)
 
 
 def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:

@@ -27,7 +27,7 @@ from typing import Any
 import filelock
 
 from warp_ar.errors import UsageError, WarpArError, counted, printable, reason
-from warp_ar.files import kind_of, parse_json, read_bytes, take_name, write_whole
+from warp_ar.files import parse_json, read_bytes, take_name, write_whole
 
 MANIFEST, RUN, LOCK, RECORD = "manifest.jsonl", "run.json", "lock", "record.json"
 ASIDE = ".aside"
@@ -137,10 +137,7 @@ def _kept(path: Path) -> bytes | None:
     Raises:
         RunError: The file is not regular, is too large, or cannot be read.
     """
-    try:
-        return None if kind_of(path) == "nothing" else read_bytes(path, "run_bytes", RunError)
-    except OSError as error:
-        raise RunError(f"{path} cannot be read: {reason(error)}") from error
+    return read_bytes(path, "run_bytes", RunError) if os.path.lexists(path) else None
 
 
 @contextlib.contextmanager
@@ -172,10 +169,8 @@ def is_locked(folder: Path) -> bool:
     try:
         if (folder / LOCK).exists():
             filelock.FileLock(folder / LOCK, timeout=0, mode=0o666).acquire().lock.release()
-    except filelock.Timeout:
-        return True
-    except (OSError, NotImplementedError):
-        pass
+    except (OSError, NotImplementedError) as error:
+        return isinstance(error, filelock.Timeout)
     return False
 
 
@@ -192,13 +187,12 @@ def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
         RunError: The folder cannot be written.
     """
     try:
-        if (kind := kind_of(folder)) not in ("folder", "nothing"):
-            told = "a file" if kind == "file" else kind
-            raise UsageError(f"--output {folder} is {told}; name a new folder")
+        if folder.exists() and not folder.is_dir():
+            raise UsageError(f"--output {folder} is no folder; name a new one")
         folder.mkdir(parents=True, exist_ok=True)
-        if (folder / RUN).exists():
+        if RUN in (left := os.listdir(folder)):
             raise UsageError(f"{folder} holds a run already; go on with: farm resume {folder}, or name another folder")
-        if left := [name for name in os.listdir(folder) if name != LOCK]:
+        if left:
             raise UsageError(f"{folder} is not empty (it holds {left[0]}); name a new folder")
         text = json.dumps({"program": "warp_ar", "version": version, "jobs": data})
         write_whole(folder / RUN, text.encode())
@@ -219,10 +213,7 @@ def load_run(folder: Path) -> tuple[dict[str, Any], str]:
         raise UsageError(
             f"{folder} holds no run ({RUN} is missing); begin one with: farm run JOBS.toml --output {folder}"
         )
-    try:
-        data = parse_json(kept.decode(), str(path), RunError)
-    except UnicodeDecodeError as error:
-        raise RunError(f"{path} cannot be read: {reason(error)}") from error
+    data = parse_json(kept.decode(errors="replace"), str(path), RunError)
     jobs = data.get("jobs") if isinstance(data, dict) else None
     if not isinstance(jobs, dict) or not isinstance(jobs.get("clip"), list) or "version" not in data:
         raise RunError(f"{path} is damaged: expected a version, and jobs with their clips")
@@ -405,9 +396,11 @@ def _kind(key: str) -> str:
 
 def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
     """Return the result of ``read_status`` in words, one string per line."""
+    counts = ", ".join(counted(count, kind) for kind, count in sorted(status["done"].items()))
+    failed = counted(len(status["failed"]), "job")
     lines = [
-        f"{folder}: {status['clips']} clips; done: {words_of_counts(status['done']) or 'nothing yet'}",
-        f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed",
+        f"{folder}: {status['clips']} clips; done: {counts or 'nothing yet'}",
+        f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {failed} failed",
         *(f"failed: {key}: {why}" for key, why in sorted(status["failed"].items())[:20]),
     ]
     if len(status["failed"]) > 20:
@@ -421,11 +414,6 @@ def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
         left = status["seconds_left"]
         lines.append("time left: too early to say" if left is None else f"time left: {words_of_seconds(left)}")
     return [printable(line) for line in lines]
-
-
-def words_of_counts(kinds: Mapping[str, int]) -> str:
-    """Return the number of jobs of each kind in words."""
-    return ", ".join(counted(count, kind) for kind, count in sorted(kinds.items()))
 
 
 def words_of_seconds(seconds: float) -> str:

@@ -205,7 +205,7 @@ class _Look:
     """Poses and light, collected over the frames of a survey."""
 
     light: str
-    """One of ``LIGHTS``."""
+    """Value of the key ``light``."""
     maps: BinaryIO
     """File of the maps."""
     poses: npt.NDArray[np.float64]
