@@ -183,7 +183,7 @@ UNSEEN = ("source.empty", "marker.unseen", "units.ball", "ball.unfound", "ball.o
 
 @pytest.mark.parametrize("name", [*UNSEEN, "ball.dull"])
 def test_a_ball_is_seen_only_where_it_was_looked_for(monkeypatch, tmp_path, name):
-    monkeypatch.setattr(checkup, "check_up", lambda *_, **__: [Finding(name, "", "")])
+    monkeypatch.setattr(checkup, "check_and_look", lambda *_, **__: ([Finding(name, "", "")], None))
     found, seen = checkup.quick_check(load_scene("desk"), tmp_path)
     assert [each.name for each in found] == [name]
     assert seen == (name not in UNSEEN)
@@ -191,6 +191,6 @@ def test_a_ball_is_seen_only_where_it_was_looked_for(monkeypatch, tmp_path, name
 
 def test_a_device_is_not_opened_twice(monkeypatch):
     looked = []
-    monkeypatch.setattr(checkup, "check_up", lambda scene, source, **how: looked.append(source) or [])
+    monkeypatch.setattr(checkup, "check_and_look", lambda scene, source, **how: (looked.append(source) or [], None))
     assert not checkup.quick_check(load_scene("desk"), 0)[1]
     assert looked == [None]

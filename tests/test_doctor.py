@@ -21,7 +21,7 @@ from warp_ar.checks.check_pictures import Look, board_instead, check_pictures, c
 from warp_ar.checks.check_print import check_print
 from warp_ar.checks.check_proxies import check_proxies
 from warp_ar.checks.check_scene import check_scene
-from warp_ar.checks.checkup import check_look, check_up
+from warp_ar.checks.checkup import check_and_look, check_look
 from warp_ar.checks.finding import Finding
 from warp_ar.errors import SceneError
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Scene, SourceSpec, load_scene, loads_scene
@@ -310,7 +310,7 @@ def test_guess_is_named():
 
 
 def test_unreadable_source_is_a_finding(tmp_path):
-    found = check_up(load_scene("desk"), tmp_path / "nothing.mp4")
+    found = check_and_look(load_scene("desk"), tmp_path / "nothing.mp4")[0]
     assert [finding.name for finding in found] == ["source.unreadable"]
 
 
@@ -325,11 +325,11 @@ def lives_line(scene, monkeypatch, source=None):
     said, names = [], []
 
     def look(*arguments, **options):
-        found = check_up(*arguments, **options)
+        found, looked = check_and_look(*arguments, **options)
         names.extend(finding.name for finding in found)
-        return found
+        return found, looked
 
-    monkeypatch.setattr(checkup, "check_up", look)
+    monkeypatch.setattr(checkup, "check_and_look", look)
     monkeypatch.setattr(live_start, "say", said.append)
     live_start.say_quick_check(argparse.Namespace(scene="my_desk", source=source), scene)
     return said, names
@@ -444,7 +444,7 @@ def test_card_is_recognised_where_a_single_marker_is_expected(number, monkeypatc
     camera, frames = card_frames
     scene = dataclasses.replace(marker(load_scene("desk"), id=number), camera=camera)
     see(frames, monkeypatch)
-    (found,) = [f for f in check_up(scene, "camera.mp4") if f.name not in {"camera.guessed"}]
+    (found,) = [f for f in check_and_look(scene, "camera.mp4")[0] if f.name not in {"camera.guessed"}]
     assert found.name == "marker.board"
     assert f"single marker of 80 mm, id {number}" in found.text
     assert f'board = "{CARD_MARKER.board}"' in found.remedy

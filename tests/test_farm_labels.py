@@ -35,7 +35,7 @@ DATASET = {
         {"name": "die", "shape": "box", "size": [0.03, 0.04, 0.02], "rest": "any"},
         {"name": "ring", "shape": "torus", "major_radius": 0.02, "minor_radius": 0.006, "scale": 1.2},
     ],
-    "light": [{"kind": "spot", "at": [0.1, -0.2, 0.4], "target": [0, 0, 0], "intensity": [0.5, 2.0], "outer_angle": 9}],
+    "light": [{"kind": "point", "at": [0.1, -0.2, 0.4], "intensity": [0.5, 2.0]}],
 }
 EDGE = 1.5
 """Pixels by which the outline of a mesh may be off one that is drawn in whole pixels."""

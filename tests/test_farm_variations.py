@@ -20,7 +20,8 @@ OBJECTS = [
     {"shape": "box", "size": [0.03, 0.05, 0.02], "rest": "any"},
     {"shape": "torus", "major_radius": 0.02, "minor_radius": 0.006, "scale": 1.5},
 ]
-LIGHT = {"kind": "spot", "at": [[-0.3, -0.3, 0.3], [0.3, 0.3, 0.5]], "target": [0, 0, 0], "intensity": [0.5, 2.0]}
+CONE = {"target": [0, 0, 0], "inner_angle": 15, "outer_angle": 8}
+LIGHT = {"kind": "spot", "at": [[-0.3, -0.3, 0.3], [0.3, 0.3, 0.5]], "intensity": [0.5, 2.0], **CONE}
 MARGIN = 0.004
 ROUNDED = 2e-6
 """Metres by which a hull of single-precision points, and a place rounded to a micrometre, may be off."""

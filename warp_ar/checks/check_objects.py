@@ -91,7 +91,7 @@ def sphere_around(item: Object) -> Probe:
 @functools.lru_cache(maxsize=64)
 def _sphere_of(mesh: Mesh) -> tuple[Array, float]:
     """Return centre (3,) and radius of a sphere around a mesh, in the mesh's coordinates."""
-    low, high = mesh.vertices.min(0).astype(np.float64), mesh.vertices.max(0).astype(np.float64)
+    low, high = mesh.bounds.astype(np.float64)
     return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
 

@@ -34,17 +34,6 @@ PIXELS: Final = 640 * 480
 """Number of pixels of a picture up to which ``SPREAD`` applies."""
 
 
-def check_up(scene: Scene, source: str | int | Path | None, *, quick: bool = False) -> list[Finding]:
-    """Return the findings on a set-up, the worst first.
-
-    Args:
-        scene: The scene.
-        source: Source of the frames; None: check the scene's numbers only.
-        quick: True to read only a few frames, which takes about a second.
-    """
-    return check_and_look(scene, source, quick=quick)[0]
-
-
 def quick_check(scene: Scene, given: str | int | Path | None) -> tuple[list[Finding], bool]:
     """Check the first frames of a recorded source in about a second.
 
@@ -57,7 +46,7 @@ def quick_check(scene: Scene, given: str | int | Path | None) -> tuple[list[Find
     """
     source = source_of(scene, given)
     recorded = isinstance(source, Path) or (isinstance(source, str) and Path(source).exists())
-    found = check_up(scene, source if recorded else None, quick=True)
+    found, _ = check_and_look(scene, source if recorded else None, quick=True)
     seen = recorded and bool(scene.probes) and not any(finding.name.startswith(_NOT_LOOKED) for finding in found)
     return found, seen
 

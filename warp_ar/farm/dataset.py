@@ -32,6 +32,7 @@ from warp_ar.scene.pixel_rays import project
 from warp_ar.scene.scene_files import SceneFiles
 from warp_ar.scene.sections import SceneTable, read_light, read_object
 from warp_ar.scene.table import Table
+from warp_ar.tracking.markers import pattern_of
 
 
 class JobsError(UsageError):
@@ -111,14 +112,10 @@ def draw(value: Any, share: Share) -> Any:
 class Entry:
     """Kind of object or light, as a table that may contain spans."""
 
-    label: str
-    """Name of the job file in messages."""
-    folder: Path
-    """Folder to which paths in the table are relative."""
-    section: str
-    """Name of the table."""
+    source: JobTable
+    """Table of the job file, for messages and paths."""
     data: Mapping[str, Any]
-    """Content of the table."""
+    """Content of the table, without keys that scenes do not have."""
     weight: float
     """Relative weight with which the kind is chosen."""
 
@@ -132,7 +129,8 @@ class Entry:
         data = draw(dict(self.data), share)
         if "outer_angle" in data:  # the table gives the angle between inner and outer cone
             data["outer_angle"] = round(data["outer_angle"] + data.get("inner_angle", 0.0), 6)
-        return SceneTable(self.label, SceneFiles(self.folder), self.section, data, list(fields_of(kind)))
+        source = self.source
+        return SceneTable(source.label, SceneFiles(source.folder), source.section, data, list(fields_of(kind)))
 
     def draw(self, share: Share) -> Any:
         """Draw one light.
@@ -249,7 +247,9 @@ def _read_object(table: JobTable) -> ObjectSpec:
             table.fail(key, "expected one value: what is labelled alike has one size; make it two objects")
     name = Path(str(data["file"])).stem if "file" in data else f"{data.get('shape')}-{table.section[15:-1]}"
     return ObjectSpec(
-        **_entry(table, data),
+        table,
+        data,
+        _weight(table),
         name=table.text("name", name),
         turn=table.span("turn", (0.0, 360.0), low=-360.0, high=360.0),
         rest=table.choice("rest", RESTS, RESTS[0]),
@@ -260,13 +260,11 @@ def _read_light(table: JobTable) -> Entry:
     table.choice("kind", ("point", "spot"))
     if "at" not in table:
         table.fail("at", "expected 3 numbers in metres, or [lowest, highest] of them")
-    return Entry(**_entry(table, {key: value for key, value in table.data.items() if key != "weight"}))
+    return Entry(table, {key: value for key, value in table.data.items() if key != "weight"}, _weight(table))
 
 
-def _entry(table: JobTable, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of ``Entry`` for a table with the given content."""
-    weight = table.number("weight", 1.0, low=0.0, high=1e6)
-    return {"label": table.label, "folder": table.folder, "section": table.section, "data": data, "weight": weight}
+def _weight(table: JobTable) -> float:
+    return table.number("weight", 1.0, low=0.0, high=1e6)
 
 
 Points = npt.NDArray[np.float64]
@@ -391,7 +389,8 @@ def _place(
     """
     receiver = receiver_of(base, dataset)
     seen = [poses[i] for i in np.linspace(0, len(poses) - 1, min(CAMERAS, len(poses))).astype(int)] if poses else []
-    marker = [_project(base, pose, _marker_corners(base)) for pose in seen] if base.has_marker else []
+    quiet = QUIET * pattern_of(base.marker).outline
+    marker = [_project(base, pose, quiet) for pose in seen] if base.has_marker else []
     taken = list(receiver.taken)
     placed: list[tuple[int, Object]] = []
     for kind in kinds:
@@ -454,20 +453,12 @@ def receiver_of(scene: Scene, dataset: Dataset) -> Receiver:
     circle = np.stack([np.cos(t := np.arange(32) * (np.pi / 16)), np.sin(t)], -1)
     taken += [_hull(circle * probe.radius + np.array(probe.center[:2])) for probe in scene.probes]
     if scene.has_marker:
-        taken.append(_hull(CARD * _marker_corners(scene)[:, :2] / QUIET))
+        taken.append(_hull(CARD * pattern_of(scene.marker).outline[:, :2]))
     return Receiver(height, region, tuple(taken))
 
 
 def _is_level(proxy: Proxy) -> bool:
     return bool(rotation_matrix(proxy.rotate)[2, 2] > 0.999)
-
-
-def _marker_corners(scene: Scene) -> Points:
-    """Return the corners of the marker or board with the white area around it that must be visible, (4, 3) metres."""
-    board = scene.marker.board
-    width, height = (scene.marker.size, scene.marker.size) if board is None else board.size
-    corners = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-    return np.asarray(0.5 * QUIET * corners * (width, height, 0.0))
 
 
 def _hull(points: Points) -> Points:

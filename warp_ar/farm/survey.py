@@ -52,7 +52,6 @@ from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
 from warp_ar.sources.deep_frame import check_linear
 from warp_ar.sources.source import RecordedSource
-from warp_ar.sources.sources import open_source
 from warp_ar.stages.features import has_environment
 from warp_ar.tracking.tracking import given_pose
 
@@ -157,20 +156,17 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
     index = index_frames(path, fps)
     first, end = lit_range(jobs.clips[clip], index.length)
     scene = scene_of(jobs, clip)
-    with open_source(path, fps=fps) as source:
-        size, names = source.size, source.names
-        coding = source.curve or ("10bit" if source.deep else "8bit")
     alone = jobs.settings.light == "preroll"
-    with open(folder / MAPS, "wb") as maps:
+    source = open_part(path, index, first, end, fps, jobs.settings.gpu_of(device))
+    with contextlib.closing(source), open(folder / MAPS, "wb") as maps:
         look = _Look(jobs.settings.light, maps, np.full((index.length, 12), np.nan))
         if not alone:
-            for number in range(first, end):
-                given = None if scene.pose is None else scene.pose.at(number, names[number] if names else "")
+            for number, name in zip(range(first, end), source.names or [""] * (end - first), strict=True):
+                given = None if scene.pose is None else scene.pose.at(number, name)
                 if given is not None:
                     look.poses[number] = np.concatenate([np.ravel(part) for part in given])
             captures = scene.captured is None and has_environment(scene)
             if captures or scene.pose is None:
-                source = open_part(path, index, first, end, fps, jobs.settings.gpu_of(device))
                 _look_at_frames(scene, source, look, jobs.settings.quality, device, captures=captures)
         if look.latest is not None:
             if jobs.settings.light == "fixed":
@@ -184,8 +180,8 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str) -> dict[str
         tick=[index.tick.numerator, index.tick.denominator],
         seekable=index.seekable,
         poses=look.poses,
-        size=size,
-        coding=coding,
+        size=source.size,
+        coding=source.curve or ("10bit" if source.deep else "8bit"),
         saturation=look.saturation,
         keys=look.keys,
         places=look.places,
@@ -260,7 +256,7 @@ def _look_at_frames(
         device: ``cpu`` or ``cuda:N``.
         captures: True to measure the light.
     """
-    with contextlib.closing(source), ThreadPoolExecutor(1, "warp_ar-survey") as packer:
+    with ThreadPoolExecutor(1, "warp_ar-survey") as packer:
         linear = keep_depth(source, scene)
         pipeline = Pipeline(
             scene,

@@ -30,7 +30,6 @@ References:
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import enum
 import math
@@ -223,12 +222,23 @@ class Tracker:
         self._pose, self._time, self._quality = pose, time, quality
         return Track(pose, TrackState.TRACKED, quality, self._outline(pose), fit.error)
 
-    def detect(self, image: Image) -> list[Detection]:
-        """Detect this marker, or the markers of this board, in a whole picture (uint8 RGB or grey).
+    def detect(
+        self, image: Image, box: Box | None = None, smallest: float = 10.0, *, sharp: bool = False
+    ) -> list[Detection]:
+        """Detect this marker, or the markers of this board; the result is independent of the camera.
 
-        The result is independent of the camera.
+        Args:
+            image: uint8 RGB or grey.
+            box: Rows and columns of the searched part; None: the whole image.
+            smallest: Mean side length in pixels of the smallest marker that must be found.
+            sharp: True to use the narrow threshold only.
+
+        Returns:
+            Detections, with corners in pixels of the whole image.
         """
-        return self._detect(image)
+        detected = self._detector.detect(self._show(image, box), max(smallest, 10.0), sharp=sharp)
+        origin = np.array((0, 0) if box is None else (box[1].start, box[0].start), np.float32)
+        return [Detection(d.id, d.corners + origin) for d in detected if d.id in self._pattern.markers]
 
     def error_of(self, image: Image, found: list[Detection]) -> float:
         """Return the reprojection error of a pose fitted to detections in one image, without earlier frames.
@@ -288,7 +298,7 @@ class Tracker:
                 fit = self._fit_guess(guess) or fit
             if fit is not None:
                 return fit
-        found = self._detect(image)
+        found = self.detect(image)
         self._rival = len(found) > len({d.id for d in found})
         fit = self._fit_detections(found, guess)
         if fit is None or not fit.edges or self._rival or len(self._pattern.markers) > 1:
@@ -336,31 +346,13 @@ class Tracker:
         if len(self._pattern.markers) == 1 and self._blurred == 0:
             for environment in (_CLOSE, _ENVIRONMENT):
                 box = self._around(expected, environment)
-                found = self._detect(image, box, smallest, sharp=True)
+                found = self.detect(image, box, smallest, sharp=True)
                 near = [d for d in found if np.linalg.norm(d.corners - expected, axis=1).mean() < _NEAR * smallest]
                 if near and (environment == _ENVIRONMENT or all(_is_inside(d.corners, box) for d in near)):
                     return found
             self._blurred = _SHARP_AGAIN
         self._blurred = max(self._blurred - 1, 0)
-        return self._detect(image, self._around(expected), smallest)
-
-    def _detect(
-        self, image: Image, box: Box | None = None, smallest: float = 10.0, *, sharp: bool = False
-    ) -> list[Detection]:
-        """Detect the markers of the print in a part of the image (default: the whole image).
-
-        Args:
-            image: uint8 RGB or grey.
-            box: Rows and columns of the part.
-            smallest: Mean side length in pixels of the smallest marker that must be found.
-            sharp: True to use the narrow threshold only.
-
-        Returns:
-            Detections, with corners in pixels of the whole image.
-        """
-        detected = self._detector.detect(self._show(image, box), max(smallest, 10.0), sharp=sharp)
-        origin = np.array((0, 0) if box is None else (box[1].start, box[0].start), np.float32)
-        return [Detection(d.id, d.corners + origin) for d in detected if d.id in self._pattern.markers]
+        return self.detect(image, self._around(expected), smallest)
 
     def _fit_detections(self, found: list[Detection], guess: Pose | None) -> Fit | None:
         found = self._chosen(found, guess)
@@ -459,7 +451,9 @@ class Tracker:
         camera = pose.apply(points)
         pixels, jacobian = self._fitter.project(camera)
         residual = pixels - corners
-        rows = _pose_rows(jacobian, camera - pose.translation).reshape(-1, 6)
+        # A rotation vector w moves the camera point R X by w x RX: a row j of the derivative becomes (RX x j, j).
+        arm = (camera - pose.translation)[:, None]
+        rows = np.concatenate([np.cross(arm, jacobian), jacobian], axis=-1).reshape(-1, 6)
         information = rows.T @ rows / _CORNER_NOISE**2
         cost = float((residual**2).mean())
         pattern = self._fitter.correlate(pose)
@@ -488,20 +482,12 @@ class Tracker:
 
         It is halved if the last detection in a whole picture found two markers with one id.
         """
-        variances = [max(value, 0.0) for value in _inverse(fit.information).diagonal().tolist()]
+        # The pseudoinverse gives unobservable motions the variance 0.
+        variances = np.maximum(np.linalg.pinv(fit.information).diagonal(), 0.0).tolist()
         turn = math.degrees(math.sqrt(sum(variances[:3])))
         shift = 100.0 * math.sqrt(sum(variances[3:])) / math.hypot(*fit.pose.translation.tolist())
         quality = min(1.0, fit.support / 0.9) / (1.0 + turn**2 + shift**2)
         return min(max(quality * (0.5 if self._rival else 1.0), 0.0), 1.0)
-
-
-def _inverse(information: Array) -> Array:
-    """Return the covariance, (6, 6), of a pose with an information matrix; unobservable motions have variance 0."""
-    with contextlib.suppress(np.linalg.LinAlgError):
-        inverse = np.asarray(np.linalg.inv(information), float)
-        if inverse.diagonal().min() > 0.0:
-            return inverse
-    return np.asarray(np.linalg.pinv(information), float)
 
 
 def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
@@ -516,23 +502,6 @@ def _is_inside(corners: NDArray[np.float32], box: Box) -> bool:
 
 def _holds(fit: Fit | None) -> TypeGuard[Fit]:
     return fit is not None and fit.support >= _SUPPORT and fit.pattern >= _PATTERN
-
-
-def _pose_rows(jacobian: Array, arm: Array) -> Array:
-    """Return the derivative (n, 2, 6) of pixels with respect to a change of pose: rotation vector w and translation d.
-
-    The change moves the camera point R X + t to exp(w) R X + t + d, which is a displacement of w x RX + d to first
-    order. A row j of the derivative by the camera point therefore becomes (RX x j, j).
-
-    Args:
-        jacobian: Derivative of the pixels by the camera points, (n, 2, 3).
-        arm: R X, (n, 3).
-    """
-    x, y, z = arm.T[:, :, None]
-    a, b, c = np.moveaxis(jacobian, 2, 0)
-    rows = np.empty((len(arm), 2, 6))
-    rows[..., 0], rows[..., 1], rows[..., 2], rows[..., 3:] = y * c - z * b, z * a - x * c, x * b - y * a, jacobian
-    return rows
 
 
 Places = Mapping[Marker, Pose | None]
