@@ -160,7 +160,7 @@ def test_a_session_moves_its_ball_first(shared):
 
 def test_a_session_without_a_marker_leaves_its_ball():
     camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
-    scene = Scene(camera=camera, marker=Marker(size=0.08), probes=(rough((0, 0, 0)),))
-    with Session(scene, source="synthetic:checker", quality="paper", refine_ball=True) as session:
+    scene = Scene(camera=camera, marker=Marker(id=7, size=0.08), probes=(rough((0, 0, 0)),))
+    with Session(scene, source="synthetic:card", quality="paper", refine_ball=True) as session:
         assert session.ball_fits == (None,)
         assert session.scene.probes == scene.probes

@@ -137,7 +137,7 @@ class SourceSpec(Checked):
     """Folder of frames in name order, or a video."""
     camera: Annotated[int | None, Key("-", "0", low=0, high=1023)] = None
     """Index of a capture device."""
-    synthetic: Annotated[str | None, Key("-", '"moving_card"', right="the name of a generated source")] = None
+    synthetic: Annotated[str | None, Key("-", '"card"', right="the name of a generated source")] = None
     """Name of a generated source."""
     fps: Annotated[float | None, Key("frames per second", "24.0", low=1e-3, high=1e5)] = None
     """Frames per second; default: the source's own."""

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.sources.frame_folder import rgb8
-from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_exposures, check_fps, check_size, distinct
+from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_size, distinct
 
 Image = npt.NDArray[np.uint8]
 
@@ -180,9 +180,7 @@ class CaptureDevice(LiveSource):
         opener: Callable[[Any], Any] = _open_device,
     ) -> None:
         super().__init__(f"capture device {device}" if isinstance(device, int) else str(device))
-        check_fps(fps)
         self._grace = grace
-        check_exposures(exposures)
         self.exposures = distinct(exposures)
         if any(longer < LEAST_RATIO * shorter for longer, shorter in itertools.pairwise(self.exposures)):
             raise UsageError(
@@ -212,7 +210,7 @@ class CaptureDevice(LiveSource):
         self.fps = told if math.isfinite(told) and told > 0 else fps or DEFAULT_FPS
         self.description = f"{self._name} ({self.size[0]}x{self.size[1]}, {self.fps:g} fps)"
         if self._bracketing is None:
-            self._newest.put(first, time.monotonic())
+            self._put(first, time.monotonic())
         self._start_reading()
 
     def _read(self) -> Image | None:
@@ -239,7 +237,7 @@ class CaptureDevice(LiveSource):
             now = time.monotonic()
             exposure = None if self._bracketing is None else self._bracketing.label(image, now)
             if self._bracketing is None or exposure is not None:
-                self._newest.put(image, now, exposure)
+                self._put(image, now, exposure)
         if not self._stop.is_set():
             raise SourceError(f"{self._name} gave no frame for {self._grace:g} s; was it unplugged?")
 

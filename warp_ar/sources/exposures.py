@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import cv2
@@ -85,7 +85,7 @@ def plan_bracket(exposures: Sequence[float], shown: float | None = None) -> Brac
     if len(kept) < len(times):
         gone = ", ".join(f"{time:g}" for time in times if time not in kept)
         notes.append(f"exposures {gone} s are left out: {MOST_EXPOSURES} of {len(times)} are merged")
-    reference = min(kept, key=lambda time: abs(math.log(time / (shown or longest))))
+    reference = _nearest(kept, shown or longest)
     if len(kept) < 2:
         return BracketPlan((), reference, notes=tuple(notes))
     left_out = tuple(time / reference for time in times if time not in kept)
@@ -99,13 +99,14 @@ def _spread(times: Sequence[float], shown: float) -> list[float]:
         times: Distinct exposure times in seconds, longest first.
         shown: Exposure time in seconds of the frames to show.
     """
-    logs = [math.log(time) for time in times]
-    chosen = {min(range(len(times)), key=lambda k: abs(logs[k] - math.log(shown)))}
-    for step in range(MOST_EXPOSURES):
-        wanted = logs[0] + (logs[-1] - logs[0]) * step / (MOST_EXPOSURES - 1)
-        if len(chosen) < MOST_EXPOSURES or step == MOST_EXPOSURES - 1:
-            chosen.add(min(range(len(times)), key=lambda k: abs(logs[k] - wanted)))
-    return [times[k] for k in sorted(chosen)][:MOST_EXPOSURES]
+    kept = {_nearest(times, time) for time in np.geomspace(times[0], times[-1], MOST_EXPOSURES).tolist()}
+    kept -= {_nearest(kept, shown)}
+    return sorted({*kept, _nearest(times, shown)}, reverse=True)
+
+
+def _nearest(times: Iterable[float], wanted: float) -> float:
+    """Return the one of some exposure times whose ratio to the wanted one is closest to 1."""
+    return min(times, key=lambda time: abs(math.log(time / wanted)))
 
 
 def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
@@ -124,7 +125,7 @@ def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
         return plan.reference
     ratio = exposure_time / plan.shown
     every = (*plan.ratios, *plan.left_out)
-    index = min(range(len(every)), key=lambda k: abs(math.log(every[k] / ratio)))
+    index = every.index(_nearest(every, ratio))
     return index if index < len(plan.ratios) else None
 
 

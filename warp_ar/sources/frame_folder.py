@@ -29,7 +29,6 @@ from warp_ar.sources.source import (
     DEFAULT_FPS,
     Frame,
     RecordedSource,
-    check_fps,
     check_size,
     distinct,
     existing_path,
@@ -59,7 +58,7 @@ class FrameFolder(RecordedSource):
 
     Raises:
         SourceError: The path does not exist or holds no image, or its first image or its ``exposures.json`` is invalid.
-        UsageError: ``fps`` or one of ``exposures`` is not a positive number.
+        UsageError: One of ``exposures`` is not a positive number.
     """
 
     def __init__(
@@ -71,7 +70,6 @@ class FrameFolder(RecordedSource):
         exposures: Sequence[float] = (),
     ) -> None:
         super().__init__(loop=loop, exposures=exposures)
-        check_fps(fps)
         path = existing_path(pathlib.Path(path))
         folder = path if path.is_dir() else path.parent
         self._paths = [path]
@@ -125,11 +123,9 @@ def read_frame(path: pathlib.Path) -> tuple[Image, DeepFrame | None]:
             picture = read_raw(path, SourceError)
         else:
             picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
-        if picture.dtype == np.uint8:
-            return rgb8(picture, label), None
-        if picture.dtype == np.uint16:
+        if picture.dtype in (np.uint8, np.uint16):
             image = rgb8(picture, label)
-            return image, DeepFrame(_three_channels(picture), codes=image)
+            return image, None if picture.dtype == np.uint8 else DeepFrame(_three_channels(picture), codes=image)
         if picture.dtype not in (np.float32, np.float64):
             raise SourceError(f"{label} holds {picture.dtype} values; 8 or 16 bits, or floats, are needed")
         light = finite_light(_three_channels(picture))

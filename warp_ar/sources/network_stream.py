@@ -18,7 +18,7 @@ import numpy.typing as npt
 from av.video.reformatter import VideoReformatter
 
 from warp_ar.errors import SourceError, reason
-from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_fps, check_size
+from warp_ar.sources.source import DEFAULT_FPS, LiveSource, check_size
 from warp_ar.sources.video_file import pixel_shape, rgb_from_video, video_stream
 
 Image = npt.NDArray[np.uint8]
@@ -63,12 +63,10 @@ class NetworkStream(LiveSource):
     Raises:
         SourceError: The stream cannot be opened or gives no picture; while iterating, the connection stays broken, or
             the pictures change their size.
-        UsageError: ``fps`` is not a positive number.
     """
 
     def __init__(self, address: str, *, fps: float | None = None, grace: float = GRACE_SECONDS) -> None:
         super().__init__(_without_password(address))
-        check_fps(fps)
         self._address, self._grace = address, grace
         self.reconnects = 0
         """Number of times that the connection was opened again."""
@@ -122,7 +120,7 @@ class NetworkStream(LiveSource):
             self.size = (image.shape[1], image.shape[0])
             self._ready.set()
         check_size(image, self.size, self._name, None)
-        self._newest.put(image, time.monotonic())
+        self._put(image, time.monotonic())
 
     def _pictures(self) -> Any:
         """Yield the pictures of one connection as they arrive."""

@@ -126,10 +126,8 @@ class Source(Closing):
     exposures: tuple[float, ...] = ()
     """All exposure times of the frames in seconds, longest first; empty if unknown."""
 
-    @property
-    def dropped(self) -> int:
-        """Return the number of frames skipped because a newer one had arrived; 0 for recorded sources."""
-        return 0
+    dropped: int = 0
+    """Number of frames skipped because a newer one had arrived; 0 for recorded sources."""
 
     def _memory_for(self, height: int, width: int) -> Image | None:
         """Return an array for a picture of that size from ``memory``; None if the source must allocate one."""
@@ -218,21 +216,43 @@ def _ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]
             executor.shutdown(wait=True, cancel_futures=True)
 
 
-class _Newest:
-    """Newest picture of each exposure, with its time, for a reader on another thread.
+class LiveSource(Source):
+    """Source that keeps the newest frame of each exposure, for a reader on another thread, and counts replaced frames.
 
-    A new picture replaces the picture of its exposure that was not taken yet, which counts as dropped. Every exposure
-    keeps a picture of its own, so that a slow reader does not miss the rare short exposures.
+    Every exposure keeps a frame of its own, so that a slow reader does not miss the rare short exposures.
     """
 
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
+    live = True
+    length = None
+
+    def __init__(self, name: str = "") -> None:
+        self._name = name
+        self._changed, self._stop = threading.Condition(), threading.Event()
         self._items: dict[float | None, tuple[Image, float]] = {}
         self._error: SourceError | None = None
         self._closed = False
-        self.dropped = 0
+        self._index = 0
 
-    def put(self, image: Image, time: float, exposure: float | None = None) -> bool:
+    def _start_reading(self) -> None:
+        """Start a thread that puts pictures."""
+        self._thread = threading.Thread(target=self._read_all, name="warp-ar-camera", daemon=True)
+        self._thread.start()
+
+    def _read_all(self) -> None:
+        failed = None
+        try:
+            self._run()
+        except SourceError as error:
+            failed = error
+        except Exception as error:  # an error of any type must reach the waiting reader
+            failed = SourceError(f"{self._name}: {reason(error)}")
+            failed.__cause__ = error
+        self._end(failed)
+
+    def _run(self) -> None:
+        """Put pictures until the source is closed."""
+
+    def _put(self, image: Image, time: float, exposure: float | None = None) -> bool:
         """Store a picture for the reader; return False if closed.
 
         Args:
@@ -248,85 +268,36 @@ class _Newest:
             self._changed.notify_all()
             return True
 
-    def close(self, error: SourceError | None = None) -> None:
-        """Accept no more pictures.
-
-        Readers still get the pictures that are left. After these, ``take`` raises ``error``, or returns None if no
-        error is given.
-        """
+    def _end(self, error: SourceError | None) -> None:
+        """Accept no more pictures; after the pictures that are left, iteration raises ``error`` if it is given."""
         with self._changed:
             if not self._closed:
                 self._closed, self._error = True, error
             self._changed.notify_all()
 
-    def take(self) -> tuple[Image, float, float | None] | None:
-        """Wait for a picture, and return the oldest with its time and exposure; None at the end.
+    def __iter__(self) -> Iterator[Frame]:
+        """Iterate over new frames, skipping all but the newest of each exposure; ends when the source is closed.
 
         Raises:
-            SourceError: The error given to ``close``, once no picture is left.
+            SourceError: The source has failed, once no picture is left.
         """
-        with self._changed:
-            self._changed.wait_for(lambda: bool(self._items) or self._closed)
-            if self._items:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._items) or self._closed)
+                if not self._items:
+                    if self._error is not None:
+                        raise self._error
+                    return
                 exposure = next(iter(self._items))
-                return (*self._items.pop(exposure), exposure)
-            if self._error is not None:
-                raise self._error
-            return None
-
-
-class LiveSource(Source):
-    """Source that keeps the newest frame and counts the frames that it replaces."""
-
-    live = True
-    length = None
-
-    def __init__(self, name: str = "") -> None:
-        self._name = name
-        self._newest, self._stop = _Newest(), threading.Event()
-        self._index = 0
-
-    def _start_reading(self) -> None:
-        """Start a thread that puts pictures into ``_newest``."""
-        self._thread = threading.Thread(target=self._read_all, name="warp-ar-camera", daemon=True)
-        self._thread.start()
-
-    def _read_all(self) -> None:
-        try:
-            self._run()
-        except SourceError as error:
-            self._end(error)
-        except Exception as error:  # an error of any type must reach the waiting reader
-            failed = SourceError(f"{self._name}: {reason(error)}")
-            failed.__cause__ = error
-            self._end(failed)
-        else:
-            self._end(None)
-
-    def _run(self) -> None:
-        """Put pictures into ``_newest`` until the source is closed."""
-
-    def _end(self, error: SourceError | None) -> None:
-        self._newest.close(error)
-
-    @property
-    def dropped(self) -> int:
-        """Return the number of frames skipped because a newer one had arrived."""
-        return self._newest.dropped
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Iterate over new frames, skipping all but the newest of each exposure; ends when the source is closed."""
-        while (item := self._newest.take()) is not None:
-            image, stamp, exposure = item
+                image, stamp = self._items.pop(exposure)
             if self._index == 0:
                 self.start = stamp
-            frame = Frame(self._index, stamp - self.start, image, exposure)
             self._index += 1
-            yield frame
+            yield Frame(self._index - 1, stamp - self.start, image, exposure)
 
     def close(self) -> None:
         """Accept no more frames; iteration ends after the frames that are left."""
-        self._newest.close()
+        self._end(None)
 
 
 class QueueSource(LiveSource):
@@ -334,14 +305,14 @@ class QueueSource(LiveSource):
 
     Args:
         size: (width, height) of every frame, in pixels.
-        fps: Nominal rate in frames per second.
         description: Description for users, one line.
     """
 
-    def __init__(self, size: tuple[int, int], *, fps: float = DEFAULT_FPS, description: str = "pushed frames") -> None:
+    fps = DEFAULT_FPS
+
+    def __init__(self, size: tuple[int, int], *, description: str = "pushed frames") -> None:
         super().__init__()
-        check_fps(fps)
-        self.size, self.fps, self.description = size, fps, f"{description} ({size[0]}x{size[1]})"
+        self.size, self.description = size, f"{description} ({size[0]}x{size[1]})"
 
     def push(self, image: Image, time: float) -> bool:
         """Add a frame, from any thread; it replaces a frame that was not yet taken.
@@ -360,7 +331,7 @@ class QueueSource(LiveSource):
             got = f"{image.dtype} {image.shape}"
             raise SourceError(f"{self.description}: a frame is {got}, not uint8 RGB (height, width, 3)")
         check_size(image, self.size, self.description, self._index)
-        return self._newest.put(np.ascontiguousarray(image), time)
+        return self._put(np.ascontiguousarray(image), time)
 
 
 def check_size(image: Image, size: tuple[int, int], name: str, index: int | None) -> None:

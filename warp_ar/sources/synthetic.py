@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.sources.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, nearest_name
+from warp_ar.sources.source import DEFAULT_FPS, Frame, RecordedSource
 
 Image = npt.NDArray[np.uint8]
 
@@ -18,11 +18,11 @@ Image = npt.NDArray[np.uint8]
 class Synthetic(RecordedSource):
     """Generated clip, the same in every run.
 
-    ``checker`` is a sliding checkerboard. ``card`` is a marker seen by a moving camera, with ground truth in `pose` and
-    `camera_matrix`. The marker is number 0 of ``DICT_4X4_50``; its black square is ``MARKER_SIZE`` metres wide.
+    ``card`` is a marker seen by a moving camera, with ground truth in `pose` and `camera_matrix`. The marker is number
+    0 of ``DICT_4X4_50``; its black square is ``MARKER_SIZE`` metres wide.
 
     Args:
-        name: ``card`` or ``checker``.
+        name: ``card``.
         size: (width, height) in pixels.
         fps: Frames per second.
         length: Number of frames.
@@ -32,7 +32,6 @@ class Synthetic(RecordedSource):
         UsageError: There is no such clip.
     """
 
-    NAMES = ("card", "checker")
     MARKER_SIZE = 0.08
 
     def __init__(
@@ -45,10 +44,8 @@ class Synthetic(RecordedSource):
         loop: bool = False,
     ) -> None:
         super().__init__(loop=loop)
-        check_fps(fps)
-        if name not in self.NAMES:
-            hint = nearest_name(name, self.NAMES) or " or ".join(self.NAMES)
-            raise UsageError(f"there is no synthetic source {name!r}; did you mean {hint}?")
+        if name != "card":
+            raise UsageError(f"there is no synthetic source {name!r}; did you mean card?")
         if min(size) < 1 or length < 1:
             raise UsageError(f"a synthetic source needs a positive size and length, not {size} and {length}")
         self.name, self.size, self.fps, self.length = name, size, fps, length
@@ -73,11 +70,10 @@ class Synthetic(RecordedSource):
         return flip @ tilt @ spin, np.array([0.03 * math.sin(phase), 0.02 * math.cos(phase), 0.35])
 
     def _decode(self) -> Generator[Frame, None, None]:
-        draw = self._draw_card if self.name == "card" else self._draw_checker
         for index in range(self.length or 0):
-            yield Frame(index, index / self.fps, draw(index))
+            yield Frame(index, index / self.fps, self._draw(index))
 
-    def _draw_card(self, index: int) -> Image:
+    def _draw(self, index: int) -> Image:
         cells, pixels, scale = 6, 32, 2
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
         marker = np.pad(cv2.aruco.generateImageMarker(dictionary, 0, cells * pixels), 2 * pixels, constant_values=240)
@@ -99,8 +95,3 @@ class Synthetic(RecordedSource):
         )
         grey = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
         return np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))
-
-    def _draw_checker(self, index: int) -> Image:
-        width, height = self.size
-        dark = (((np.arange(width) + index) // 32)[None, :] + (np.arange(height) // 32)[:, None]) % 2 == 0
-        return np.where(dark[..., None], np.array([40, 60, 90], np.uint8), np.array([220, 200, 170], np.uint8))

@@ -67,6 +67,8 @@ HD_HEIGHT = 720
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 
 _STEPS = 65536
+_LAST_CODE: Final = round((1.0 - CLIP_MARGINS[0] / 255.0) * (_STEPS - 1))
+"""Step of a signal from which a channel counts as clipped."""
 
 # If an encoder has rounded the picture's size, the pixel aspect ratio compensates: 854x480 for 16:9 has 1280:1281.
 _NEARLY_SQUARE = 0.005
@@ -387,13 +389,9 @@ def deep_frame_from_video(
     if transfer not in (ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67) and wide is None:
         return DeepFrame(_steps(signal).astype(np.uint16))
     light = _light_table(int(transfer))[_steps(signal)]
-    clip = float("inf") if transfer == ColorTrc.SMPTE2084 else float(_light_table(int(transfer))[_last_code()])
+    clip = float("inf") if transfer == ColorTrc.SMPTE2084 else float(_light_table(int(transfer))[_LAST_CODE])
     light = converted(light, REC_709 if wide is None else wide, REC_709)
     return DeepFrame(light, clip, srgb8(light))
-
-
-def _last_code() -> int:
-    return round((1.0 - CLIP_MARGINS[0] / 255.0) * (_STEPS - 1))
 
 
 def _steps(signal: Float) -> npt.NDArray[np.int32]:
