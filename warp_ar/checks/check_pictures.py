@@ -7,7 +7,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -48,8 +48,6 @@ tone curve raises the measured ratio to 35 to 43 with half of smoothstep, and to
 SHADOW: Final = 0.45
 """Difference between the 85th and the 15th percentile of the logarithm of white cells' radiance, without its linear
 gradient across the card, above which there is a shadow."""
-BLURRED: Final = 6.0
-"""Width in pixels of a printed edge, from 10 to 90 % of its height, above which the picture is out of focus."""
 SHARP: Final = 0.14
 """Contrast per pixel of the sharpest edges, relative to the picture's contrast, below which the picture is blurred. It
 is 0.4 in focus, and 0.08 to 0.13 with 4 pixels of blur."""
@@ -466,31 +464,14 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
 
 
 def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]) -> Iterator[Finding]:
-    """Yield a finding if printed edges are too wide in the pictures."""
-    pattern, widths = pattern_of(marker), []
-    taps = np.linspace(-8, 8, 65)
+    """Yield a finding if the print is blurred in most of the pictures."""
+    blurred = []
     for image, pose in views:
-        pixels = project(look.camera, pose.apply(pattern.points))
-        ahead = project(look.camera, pose.apply(pattern.points + 1e-4 * pattern.normals)) - pixels
-        scale = np.linalg.norm(ahead, axis=1)
-        room = pattern.clearances * scale / 1e-4
-        chosen = room > 9.0
-        if chosen.sum() < 8:
-            continue
-        across = ahead[chosen] / scale[chosen, None]
-        places = (pixels[chosen][:, None] + taps[None, :, None] * across[:, None]).astype(np.float32)
-        profile = cv2.remap(_gray(image), places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(float)
-        profile = np.median(profile - profile[:, :4].mean(1, keepdims=True), axis=0)
-        top = profile[-4:].mean()
-        if top > 10:
-            widths.append(_rise(profile / top, taps))
-    if widths and np.median(widths) > BLURRED:
-        text = f"the picture is blurred: {np.median(widths):.0f} pixels across a printed edge"
-        yield Finding("picture.blurred", text, "focus on the card, and keep the camera still")
-
-
-def _rise(profile: Array, taps: Any) -> float:
-    return float(taps[np.argmax(profile > 0.9)] - taps[np.argmax(profile > 0.1)])
+        pixels = project(look.camera, pose.apply(pattern_of(marker).outline)).astype(np.float32)
+        x, y, width, height = cv2.boundingRect(pixels)
+        blurred.append(_is_blurred(image[max(y, 0) : y + height, max(x, 0) : x + width]))
+    if np.mean(blurred) > 0.5:
+        yield Finding("picture.blurred", "the card is blurred", "focus on the card, and keep the camera still")
 
 
 def check_saturation(scene: Scene, look: Look) -> list[Finding]:

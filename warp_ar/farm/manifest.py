@@ -357,7 +357,7 @@ PACE = 50
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """Return the progress of a run, as data for JSON: jobs by state, frames, bytes, rates of workers and time left.
+    """Return the progress of a run, as data for JSON: jobs by state, frames, bytes and time left.
 
     Raises:
         UsageError: The folder has no run.
@@ -370,22 +370,17 @@ def read_status(folder: Path) -> dict[str, Any]:
     failed = sum(_kind(key) in ("segment", "variation") for key in manifest.failed)
     known = sum(int(line.get("jobs") or 0) for line in manifest.done.values())
     left = max(known - len(lit) - failed, 0)
-    frames, seconds = collections.Counter[int](), collections.defaultdict[int, float](float)
-    for line in lit:
-        frames[int(line.get("worker") or 0)] += int(line.get("frames") or 0)
-        seconds[int(line.get("worker") or 0)] += float(line.get("seconds") or 0.0)
     ended = sorted(float(line.get("ended") or 0.0) for line in lit)[-PACE:]
     return {
         "version": version,
         "clips": len(data["clip"]),
         "done": dict(kinds),
-        "frames": frames.total(),
+        "frames": sum(int(line.get("frames") or 0) for line in lit),
         "bytes": sum(int(line.get("bytes") or 0) for line in manifest.done.values()),
         "failed": manifest.failed,
         "running": is_locked(folder),
         "jobs_known": known,
         "jobs_open": left,
-        "workers": {n: round(frames[n] / max(seconds[n], 1e-3), 2) for n in sorted(frames)},
         "seconds_left": round(left * (ended[-1] - ended[0]) / (len(ended) - 1), 1) if len(ended) > 1 else None,
     }
 
@@ -410,7 +405,6 @@ def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
         hint = f"go on with: farm resume {folder}" if status["jobs_open"] else "nothing that is known is open"
         lines.append(f"no driver is at work; {hint}")
     else:
-        lines += [f"worker {number}: {rate:.1f} frames/s" for number, rate in status["workers"].items()]
         left = status["seconds_left"]
         lines.append("time left: too early to say" if left is None else f"time left: {words_of_seconds(left)}")
     return [printable(line) for line in lines]
