@@ -16,7 +16,7 @@ from warp_ar.scene import GridBoard, Light, Marker, Object, Pose, Probe, Proxy, 
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.stages.quality import PRESETS
-from warp_ar.tracking.tracking import OwnMarkers, own_markers
+from warp_ar.tracking.tracking import Tracker, own_markers, track_markers
 
 WORLD, CARD = Marker(id=0, size=0.08), Marker(id=7, size=0.05)
 BOARD = Marker("DICT_4X4_100", board=GridBoard(2, 2, 0.03, 0.01))
@@ -43,16 +43,16 @@ def place(x: float, y: float, turn: float) -> Pose:
 def test_markers_are_found_where_they_lie() -> None:
     scene = Scene(CAMERA, objects=(Object("sphere", radius=0.01, marker=CARD),), lights=(Light("point", 1.0),))
     camera_from_world = look(25.0, turn=10.0)
-    markers = OwnMarkers(scene, CAMERA)
+    trackers = {marker: Tracker(marker, CAMERA) for marker in own_markers(scene)}
     truth = place(0.12, 0.03, 35.0)
     frame = render((WORLD, camera_from_world), (CARD, camera_from_world.after(truth)))
-    found = markers.track(frame, 0.0, camera_from_world)[CARD]
+    found = track_markers(trackers, frame, 0.0, camera_from_world)[CARD]
     assert found is not None
     np.testing.assert_allclose(found.translation, truth.translation, atol=METRES)
     np.testing.assert_allclose(found.rotation, truth.rotation, atol=np.radians(DEGREES))
-    assert markers.track(frame, 0.1, None) == {CARD: None}
+    assert track_markers(trackers, frame, 0.1, None) == {CARD: None}
     nothing = render((WORLD, camera_from_world))
-    assert OwnMarkers(scene, CAMERA).track(nothing, 0.0, camera_from_world) == {CARD: None}
+    assert track_markers({CARD: Tracker(CARD, CAMERA)}, nothing, 0.0, camera_from_world) == {CARD: None}
 
 
 def test_objects_lights_and_proxies_ride(device: str) -> None:

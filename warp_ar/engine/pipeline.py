@@ -45,7 +45,7 @@ from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.stages.request import Estimates, Request
-from warp_ar.tracking.tracking import OwnMarkers, Places, Track, Tracker, TrackState, given_pose, own_markers
+from warp_ar.tracking.tracking import Places, Track, Tracker, TrackState, given_pose, own_markers, track_markers
 
 __all__ = ["DEFAULT_FRAME_INTERVAL", "TRACK", "Pipeline", "Result", "resolve_quality"]
 
@@ -214,7 +214,7 @@ class Pipeline(Closing):
     def _allocate(self, arrays: Arrays, spare: Mapping[str, Any]) -> None:
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
-        self._own_markers = OwnMarkers(self.scene, self.camera)
+        self._own_markers = {marker: Tracker(marker, self.camera) for marker in own_markers(self.scene)}
         self._index = 0  # index of the next frame of these arrays
         self._borrowed = Borrowed(self.device)
         self._arrays = arrays
@@ -659,7 +659,7 @@ class Pipeline(Closing):
             with exclusive(self.device):
                 image = image.numpy()
         start = time.perf_counter()
-        places = self._own_markers.track(cast(Image, image), now, pose)
+        places = track_markers(self._own_markers, cast(Image, image), now, pose)
         before = timings[TRACK].milliseconds if TRACK in timings else 0.0
         timings[TRACK] = StageTiming(before + (time.perf_counter() - start) * 1e3, False)
         return places

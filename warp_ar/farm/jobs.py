@@ -223,7 +223,7 @@ def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[s
         clip: Content of the table.
 
     Raises:
-        JobsError: The pattern matches no file, or several although the clip has a name.
+        JobsError: The pattern matches no file.
     """
     table = JobTable(label, folder, f"clip[{index}]", clip, _CLIP_KEYS)
     pattern = table.text("path", "")
@@ -232,8 +232,6 @@ def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[s
     found = sorted(glob.glob(pattern, root_dir=folder, recursive=True))
     if not found:
         table.fail("path", f"no file in {folder} matches")
-    if "name" in table and len(found) > 1:
-        table.fail("name", f"the pattern of path matches {len(found)} files, each named by its own; leave name out")
     return [{**table.data, "path": name} for name in found]
 
 
@@ -252,20 +250,19 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
     top = JobTable(label, folder, "", data, ("schema", "run", "clip", "dataset", "folder"))
     if data.get("schema") != SCHEMA:
         top.fail("schema", f"expected {SCHEMA}")
-    settings: Settings = JobTable(label, folder, "run", data.get("run", {}), list(fields_of(Settings))).read(Settings)
+    run = JobTable(label, folder, "run", data.get("run", {}), list(fields_of(Settings)))
+    settings: Settings = run.read(Settings)
     names: dict[str, int] = {}
     clips = []
     for index, entry in enumerate(data["clip"]):
         clips.append(_read_clip(JobTable(label, folder, f"clip[{index}]", entry, _CLIP_KEYS), names))
     dataset = None if "dataset" not in data else read_dataset(label, folder, data["dataset"])
     if dataset is not None and settings.light == "preroll":
-        raise JobsError(
-            f'{label}: run.light = "preroll": a data set needs light that is captured once; "follow" or "fixed"'
-        )
+        run.fail("light", 'a data set needs light that is captured once; "follow" or "fixed"')
     if dataset is not None and settings.coding != AS_RECORDED:
-        raise JobsError(f"{label}: run.coding = {settings.coding!r}: a data set is pictures of 8 bits; leave it out")
+        run.fail("coding", "a data set is pictures of 8 bits; leave it out")
     if dataset is not None and settings.digests:
-        raise JobsError(f"{label}: run.digests: the manifest has a digest of each variation already; leave it out")
+        run.fail("digests", "the manifest has a digest of each variation already; leave it out")
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         _check_exposure(label, jobs, clips[scene], scene_of(jobs, scene))

@@ -9,7 +9,6 @@ file that ``python -m warp_ar.live`` can show. Masks, depth and normals are samp
 from __future__ import annotations
 
 import collections
-import dataclasses
 import json
 import shutil
 from collections.abc import Sequence
@@ -44,18 +43,10 @@ _THREADS = 2
 Mask = npt.NDArray[np.bool_]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Pictures:
-    """Pictures of a frame, in the form of one picture for ``ThreadedSink``."""
+class _Pictures(dict[str, npt.NDArray[Any]]):
+    """Pictures of a frame by their paths in the variation's folder, without suffix, as one of ``ThreadedSink``."""
 
-    shape: tuple[int, ...]
-    """Shape of the lit picture."""
-    files: dict[str, npt.NDArray[Any]]
-    """Pictures by their paths in the variation's folder, without suffix."""
-
-    def copy(self) -> _Pictures:
-        """Return this object itself; no copy is needed, because nothing else refers to its arrays."""
-        return self
+    shape = ()
 
 
 class LabelWriter(ThreadedSink):
@@ -120,13 +111,13 @@ class LabelWriter(ThreadedSink):
                 self._annotate(number, kind, seen, infos[-1])
         self._tables["gt"][str(number)] = poses
         self._tables["gt_info"][str(number)] = infos
-        self.write(_Pictures(lit.image.shape, files))
+        self.write(_Pictures(files))
 
     def _check(self, image: Any) -> None:
-        assert isinstance(image, _Pictures)
+        """Take any pictures."""
 
     def _store(self, index: int, image: Any) -> None:
-        for name, picture in image.files.items():
+        for name, picture in image.items():
             store(self._folder / f"{name}.png", encode_png(picture, PNG_OPTIONS if picture.ndim == 3 else ()))
 
     def _trace(self, pipeline: Pipeline) -> npt.NDArray[np.uint64]:

@@ -14,7 +14,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import threadpoolctl
 
 from warp_ar.closing import Closing
@@ -133,7 +132,7 @@ class Work(Closing):
                 picture = lit.image if coding == "8bit" else lit.radiance
                 sink.write_at(picture, float(int(ticks[job.first + count] - ticks[job.first]) * tick))
                 if digests is not None:
-                    digests.write(digest_of(picture) + "\n")
+                    digests.write(hashlib.sha256(np.ascontiguousarray(picture).data).hexdigest() + "\n")
                 count += 1
         return {"frames": count}
 
@@ -184,11 +183,6 @@ class Work(Closing):
         return {"frames": count}
 
 
-def digest_of(picture: npt.NDArray[Any]) -> str:
-    """Return the SHA-256 digest of a picture's bytes, row by row, in hexadecimal."""
-    return hashlib.sha256(np.ascontiguousarray(picture).data).hexdigest()
-
-
 def _free_bytes(folder: Path) -> int:
     try:
         return shutil.disk_usage(folder).free
@@ -204,8 +198,5 @@ def _note(log: Path, line: str, more: str = "") -> None:
         line: The line, before which date and time are written.
         more: Further text after the line.
     """
-    try:
-        with open(log, "a", encoding="utf-8") as stream:
-            stream.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n{more}")
-    except OSError:
-        return
+    with contextlib.suppress(OSError), open(log, "a", encoding="utf-8") as stream:
+        stream.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n{more}")

@@ -514,35 +514,22 @@ def own_markers(scene: Scene) -> tuple[Marker, ...]:
     return tuple(dict.fromkeys(item.marker for item in items if item.marker is not None))
 
 
-class OwnMarkers:
-    """Trackers of all markers to which parts of a scene are attached."""
+def track_markers(
+    trackers: Mapping[Marker, Tracker], image: NDArray[np.uint8], time: float, camera_from_world: Pose | None
+) -> Places:
+    """Return markers' poses in the world; all are None while ``camera_from_world`` is unknown.
 
-    def __init__(self, scene: Scene, camera: Camera) -> None:
-        """Create the trackers.
-
-        Args:
-            scene: Scene whose objects, lights, proxies and balls are attached to markers.
-            camera: Camera of the frames.
-        """
-        self._trackers = {marker: Tracker(marker, camera) for marker in own_markers(scene)}
-
-    def __bool__(self) -> bool:
-        """Return True if any part of the scene is attached to a marker."""
-        return bool(self._trackers)
-
-    def track(self, image: NDArray[np.uint8], time: float, camera_from_world: Pose | None) -> Places:
-        """Return the markers' poses in the world; all are None while ``camera_from_world`` is unknown.
-
-        Args:
-            image: uint8 RGB, (height, width, 3).
-            time: Time of the frame, seconds.
-            camera_from_world: Pose of the camera by the world's marker or from the scene; None if unknown.
-        """
-        found = {marker: tracker.track(image, time).pose for marker, tracker in self._trackers.items()}
-        if camera_from_world is None:
-            return dict.fromkeys(found)
-        world = camera_from_world.inverse()
-        return {marker: None if pose is None else world.after(pose) for marker, pose in found.items()}
+    Args:
+        trackers: Tracker of each marker.
+        image: uint8 RGB, (height, width, 3).
+        time: Time of the frame, seconds.
+        camera_from_world: Pose of the camera by the world's marker or from the scene; None if unknown.
+    """
+    found = {marker: tracker.track(image, time).pose for marker, tracker in trackers.items()}
+    if camera_from_world is None:
+        return dict.fromkeys(found)
+    world = camera_from_world.inverse()
+    return {marker: None if pose is None else world.after(pose) for marker, pose in found.items()}
 
 
 _NO_POSE = Track(None, TrackState.LOST, 0.0, None, math.inf)
