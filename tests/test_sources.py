@@ -465,7 +465,7 @@ def test_truncated_video_gives_what_is_whole_and_names_the_frame(
 
 def test_empty_and_foreign_files(tmp_path: pathlib.Path) -> None:
     (tmp_path / "empty.mp4").write_bytes(b"")
-    assert "0 bytes" in error_of(tmp_path / "empty.mp4")
+    assert "cannot be read as a video" in error_of(tmp_path / "empty.mp4")
     (tmp_path / "text.mp4").write_text("This is not a video. " * 100)
     assert "cannot be read as a video" in error_of(tmp_path / "text.mp4")
     (tmp_path / "text.txt").write_text("This is not a video. " * 100)

@@ -39,7 +39,7 @@ from warp_ar.errors import UsageError
 from warp_ar.files import store
 from warp_ar.signature import PROGRAM
 from warp_ar.srgb import decode_srgb
-from warp_ar.tracking.card_layout import CARD_MARKER, GREY_SIZE, GREYS, grey_centers
+from warp_ar.tracking.card_layout import CARD_BOARD, CARD_MARKER, GREY_SIZE, GREYS, grey_centers
 from warp_ar.tracking.markers import make_board, printed_cells
 
 Array = NDArray[np.float64]
@@ -203,8 +203,7 @@ def _sample(image: Image) -> _Samples | None:
     if ids is None or len(ids) < CORNERS:
         return None
     # OpenCV's board has its origin at a corner with y down the page; the card has it at the centre with y up.
-    assert CARD_MARKER.board is not None
-    width, height = CARD_MARKER.board.size
+    width, height = CARD_BOARD.size
     flat = np.asarray(board.getChessboardCorners(), float)[np.ravel(ids)][:, :2]
     flat = (flat - (width / 2, height / 2)) * (1.0, -1.0)
     matrix, _ = cv2.findHomography(flat, np.asarray(corners, float).reshape(-1, 2), cv2.RANSAC, 2.0)

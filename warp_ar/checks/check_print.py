@@ -19,7 +19,7 @@ from warp_ar.calibration.card import PAPERS
 from warp_ar.checks.finding import Finding
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
 from warp_ar.scene.pixel_rays import project
-from warp_ar.tracking.card_layout import CARD_MARKER, board_top
+from warp_ar.tracking.card_layout import CARD_BOARD, CARD_MARKER, board_top
 
 Image = NDArray[np.uint8]
 
@@ -48,8 +48,7 @@ FEWEST: Final = 2
 
 def card_scale(marker: Marker) -> float | None:
     """Return the ratio of a marker's lengths to those of the printed card; None if it is not that card."""
-    board, made = marker.board, CARD_MARKER.board
-    assert isinstance(made, CharucoBoard)
+    board, made = marker.board, CARD_BOARD
     if not isinstance(board, CharucoBoard) or marker.dictionary != CARD_MARKER.dictionary:
         return None
     if (board.columns, board.rows) != (made.columns, made.rows):
@@ -73,7 +72,7 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
     if len(sheets) < FEWEST:
         return []
     width, upper = (float(value) for value in np.median(sheets, axis=0))
-    best: tuple[float, float, str] | None = None
+    tried = []
     for paper in ("a4", "letter"):
         paper_width, height = (length / 1e3 for length in PAPERS[paper])
         # True metres per metre in the scene: above 1 if the print is larger than the scene states.
@@ -81,21 +80,17 @@ def check_print(marker: Marker, camera: Camera, views: Sequence[tuple[Image, Pos
         # Printers scale a page about its centre.
         printed = factor * told
         top = (height / 2 - printed * (height / 2 - board_top(height))) / factor
-        if best is None or abs(top - upper) < best[0]:
-            best = (abs(top - upper), factor, paper)
-    assert best is not None
-    miss, factor, paper = best
+        tried.append((abs(top - upper), factor, paper))
+    miss, factor, paper = min(tried)
     if miss > SAME or abs(factor - 1.0) < OFF:
         return []
-    made = CARD_MARKER.board
-    assert isinstance(made, CharucoBoard)
     right = factor * told
-    lengths = f"{made.square_length * right:.5f} {made.marker_length * right:.5f}"
+    lengths = f"{CARD_BOARD.square_length * right:.5f} {CARD_BOARD.marker_length * right:.5f}"
     name = "A4" if paper == "a4" else "Letter"
     text = f"the card is printed at {right:.1%}, measured from its {name} paper; [marker] has {told:.1%}"
     remedy = (
         f"measure its rulers, which should be {100 * right:.1f} mm, and write [marker] board = "
-        f'"charuco {made.columns}x{made.rows} {lengths}"; or print it at 100 %'
+        f'"charuco {CARD_BOARD.columns}x{CARD_BOARD.rows} {lengths}"; or print it at 100 %'
     )
     return [Finding("card.print", text, remedy)]
 

@@ -226,7 +226,7 @@ class FrameInputs:
             self._write_probes()
         if self._drift is None or other._drift is None or self._drift.watches != other._drift.watches:
             return
-        self._drift = other._drift.copied()
+        self._drift = copy.deepcopy(other._drift)
         self._have_lights_shine()
         if self._drift.contrast != 0.0:
             self._write_decode()

@@ -68,8 +68,6 @@ class NetworkStream(LiveSource):
     def __init__(self, address: str, *, fps: float | None = None, grace: float = GRACE_SECONDS) -> None:
         super().__init__(_without_password(address))
         self._address, self._grace = address, grace
-        self.reconnects = 0
-        """Number of times that the connection was opened again."""
         self._ready = threading.Event()
         self._problem = ""
         self._failed: SourceError | None = None
@@ -108,7 +106,6 @@ class NetworkStream(LiveSource):
                 raise SourceError(f"{self._name} {what} ({self._problem}); check its address, and that it is on")
             self._stop.wait(pause)
             pause = min(2.0 * pause, LONGEST_PAUSE)
-            self.reconnects += 1
 
     def _end(self, error: SourceError | None) -> None:
         self._failed = error

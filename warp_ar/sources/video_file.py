@@ -113,10 +113,6 @@ class VideoFile(RecordedSource):
         check_fps(fps)
         self._path = existing_path(pathlib.Path(path))
         self._retimed = fps is not None
-        if self._path.is_dir():
-            raise SourceError(f"{self._path} is a folder, not a video file")
-        if self._path.stat().st_size == 0:
-            raise SourceError(f"{self._path} is empty (0 bytes); a video file is needed")
         with self._open() as container:
             stream = container.streams.video[0]
             rate = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)

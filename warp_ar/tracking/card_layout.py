@@ -17,7 +17,8 @@ from warp_ar.scene import CharucoBoard, Marker
 
 Image = NDArray[np.uint8]
 
-CARD_MARKER: Final = Marker(dictionary="DICT_4X4_50", board=CharucoBoard(5, 4, 0.032, 0.024))
+CARD_BOARD: Final = CharucoBoard(5, 4, 0.032, 0.024)
+CARD_MARKER: Final = Marker(dictionary="DICT_4X4_50", board=CARD_BOARD)
 """Board of the card; its few, large cells are resolved by a camera of 640 x 480 at arm's length."""
 BALL_PLACE: Final = (0.0, 0.114)
 """Point where the ball touches the card, metres. It is behind the board, so that the ball does not hide the board from
@@ -43,8 +44,7 @@ _DOT: Final = 0.00025
 
 def grey_centers() -> NDArray[np.float64]:
     """Return the centres of the grey patches, (n, 3) metres in the board's frame, in the order of ``GREYS``."""
-    assert isinstance(CARD_MARKER.board, CharucoBoard)
-    pitch, height = CARD_MARKER.board.square_length, CARD_MARKER.board.size[1]
+    pitch, height = CARD_BOARD.square_length, CARD_BOARD.size[1]
     x = (np.arange(len(GREYS)) - (len(GREYS) - 1) / 2) * pitch
     return np.column_stack([x, np.full(len(GREYS), -(height / 2 + 0.004 + GREY_SIZE[1] / 2)), np.zeros(len(GREYS))])
 

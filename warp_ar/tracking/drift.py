@@ -26,9 +26,6 @@ their disagreement is below ``BETTER`` times the disagreement without contrast.
 
 from __future__ import annotations
 
-import copy
-from typing import Self
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -113,13 +110,6 @@ class ExposureDrift:
         """Estimated code at which each channel saturates."""
         self.contrast = 0.0
         """Contrast of the camera's tone curve, as defined by ``without_contrast``."""
-
-    def copied(self) -> Self:
-        """Return an independent copy with all observations so far, for another pipeline."""
-        other = copy.copy(self)
-        other._first, other._first_gain = self._first.copy(), self._first_gain.copy()
-        other._disagreements = list(self._disagreements)
-        return other
 
     def observe(self, image: NDArray[np.uint8], pose: Pose, deep: DeepFrame | None = None) -> bool:
         """Update gain and contrast from a frame.

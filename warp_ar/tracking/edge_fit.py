@@ -105,8 +105,8 @@ class EdgeFitter:
             camera: Camera of the pictures.
         """
         self._pattern = pattern
-        self._matrix = np.asarray(camera.matrix(), float)
-        self._distortion = np.asarray(camera.distortion, float).ravel()
+        self.matrix = np.asarray(camera.matrix(), float)
+        self.distortion = np.asarray(camera.distortion, float).ravel()
         self._linear = decode_table(camera.transfer).mean(1).astype(np.float32)
         self.gray: Image = np.zeros((camera.height, camera.width), np.uint8)
         self._box: Box = slice(0, camera.height), slice(0, camera.width)
@@ -133,7 +133,7 @@ class EdgeFitter:
         """Return the pixels, (n, 2), of points in the camera's frame, (n, 3), and their derivatives, (n, 2, 3)."""
         # With identity pose, OpenCV's derivative by the translation equals the derivative by the point.
         zero = np.zeros(3)
-        pixels, jacobian = cv2.projectPoints(points, zero, zero, self._matrix, self._distortion)
+        pixels, jacobian = cv2.projectPoints(points, zero, zero, self.matrix, self.distortion)
         return pixels.reshape(-1, 2), np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
 
     def fit(self, pose: Pose, reaches: Sequence[float]) -> Fit | None:

@@ -179,9 +179,6 @@ class Tracker:
             raise UsageError(f"hold = {hold}: expected seconds, 0 or more")
         self._pattern = pattern_of(marker)
         self._detector = MarkerDetector(marker.dictionary)
-        self._shape = (camera.height, camera.width)
-        self._matrix = np.asarray(camera.matrix(), float)
-        self._distortion = np.asarray(camera.distortion, float).ravel()
         self._hold, self._steady = hold, steady
         self._fitter = EdgeFitter(self._pattern, camera)
         self.reset()
@@ -206,8 +203,8 @@ class Tracker:
         Raises:
             UsageError: The image does not have the camera's size, or is not 8-bit.
         """
-        if image.dtype != np.uint8 or image.shape[:2] != self._shape or image.shape[2:] not in ((), (3,)):
-            h, w = self._shape
+        if image.dtype != np.uint8 or image.shape[:2] != self._fitter.gray.shape or image.shape[2:] not in ((), (3,)):
+            h, w = self._fitter.gray.shape
             raise UsageError(f"image: {image.dtype} {image.shape} should be uint8 ({h}, {w}, 3), the camera's size")
         if not 0 <= time - self._time <= self._hold:
             self.reset()  # the last measurement is too old for a prediction, or time went backwards
@@ -309,7 +306,7 @@ class Tracker:
 
     def _show(self, image: Image, box: Box | None = None) -> Image:
         """Set the part of an image for fitting (default: the whole image), and return it in grey."""
-        h, w = self._shape
+        h, w = self._fitter.gray.shape
         return self._fitter.show(image, (slice(0, h), slice(0, w)) if box is None else box)
 
     def _around(self, outline: NDArray[np.float32], environment: float = _ENVIRONMENT) -> Box:
@@ -321,7 +318,7 @@ class Tracker:
         """
         low, high = outline.min(0), outline.max(0)
         environment = environment * float((high - low).max()) + 16
-        h, w = self._shape
+        h, w = self._fitter.gray.shape
         (x0, y0), (x1, y1) = np.clip(low - environment, 0, (w - 32, h - 32)), np.clip(high + environment, 32, (w, h))
         return slice(int(y0), int(np.ceil(y1))), slice(int(x0), int(np.ceil(x1)))
 
@@ -402,7 +399,7 @@ class Tracker:
         facing = np.diag([1.0, -1.0, -1.0])
         try:
             _, rotations, translations, _ = cv2.solvePnPGeneric(
-                points @ facing, corners, self._matrix, self._distortion, flags=cv2.SOLVEPNP_IPPE
+                points @ facing, corners, self._fitter.matrix, self._fitter.distortion, flags=cv2.SOLVEPNP_IPPE
             )
         except cv2.error:  # collinear corners
             return []

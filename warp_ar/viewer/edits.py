@@ -44,7 +44,7 @@ from warp_ar.scene.scene_files import files_of
 from warp_ar.scene.textures import file_stamp
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
-from warp_ar.tracking.card_layout import CARD_MARKER, RINGS, ball_center
+from warp_ar.tracking.card_layout import CARD_BOARD, CARD_MARKER, RINGS, ball_center
 from warp_ar.viewer.protocol import EFFECTS, Command
 
 _T = TypeVar("_T")
@@ -174,8 +174,7 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
     if not _SCALES[0] <= scale <= _SCALES[1]:
         low, high = (1e3 * RULER * bound for bound in _SCALES)
         raise UsageError(f"the print's ruler measures {1e3 * ruler:g} mm; expected {low:g} to {high:g} mm")
-    made = CARD_MARKER.board
-    assert isinstance(made, CharucoBoard)
+    made = CARD_BOARD
     lengths = (round(made.square_length * scale, 7), round(made.marker_length * scale, 7))
     board = CharucoBoard(made.columns, made.rows, *lengths)
     x, y, _ = ball_center(radius)
