@@ -11,7 +11,7 @@ from warp_ar import Pipeline
 from warp_ar.scene import Pose, Scene, loads_scene
 from warp_ar.sources.deep_frame import DeepFrame
 from warp_ar.tracking.drift import CONTRASTS, ExposureDrift
-from warp_ar.tracking.markers import printed_cells
+from warp_ar.tracking.markers import pattern_of
 
 SCENE = """schema = 1
 [camera]
@@ -47,8 +47,9 @@ def linear_picture(scene: Scene, ink: float = 0.03) -> np.ndarray:
     y, x = np.mgrid[:120, :160]
     table = 0.15 + 0.1 * (x / 160) + 0.03 * np.sin(0.7 * x) * np.sin(0.9 * y)
     picture = np.repeat(table[..., None], 3, axis=2) * np.array([1.0, 0.9, 0.8])
-    cells, white, side, _ = printed_cells(scene.marker)
-    for cell, is_white in zip(cells, white, strict=True):
+    pattern = pattern_of(scene.marker)
+    side = pattern.side
+    for cell, is_white in zip(pattern.cells, pattern.white, strict=True):
         at = scene.camera.matrix() @ (POSE.rotation @ cell + POSE.translation)
         u, v = at[:2] / at[2]
         half = 0.5 * side * scene.camera.fx / 0.8

@@ -464,4 +464,4 @@ def test_the_print_of_an_old_board_is_as_opencv_draws_it():
         picture = board_picture(5, 4, legacy)[40:-40, 40:-40]
         at = np.round(pattern.cells[:, :2] * (1000, -1000) + (200, 160) - 0.5).astype(int)
         shown = picture[np.clip(at[:, 1], 0, 319), np.clip(at[:, 0], 0, 399)] > 127
-        np.testing.assert_array_equal(shown, pattern.white > 0.5)
+        np.testing.assert_array_equal(shown, pattern.white)

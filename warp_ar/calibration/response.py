@@ -40,7 +40,7 @@ from warp_ar.files import store
 from warp_ar.signature import PROGRAM
 from warp_ar.srgb import decode_srgb
 from warp_ar.tracking.card_layout import CARD_BOARD, CARD_MARKER, GREY_SIZE, GREYS, grey_centers
-from warp_ar.tracking.markers import make_board, printed_cells
+from warp_ar.tracking.markers import make_board, pattern_of
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -227,7 +227,8 @@ def _sample(image: Image) -> _Samples | None:
 
 def _add_cells(image: Image, matrix: Array, places: list[Array], shares: list[float], codes: list[Array]) -> None:
     """Add the board's white and black cells, averaged over zones."""
-    cells, white, side, _ = printed_cells(CARD_MARKER)
+    pattern = pattern_of(CARD_MARKER)
+    cells, white, side = pattern.cells, pattern.white, pattern.side
     middle = np.column_stack([a.ravel() for a in np.meshgrid(*[np.linspace(-0.15, 0.15, 3) * side] * 2)])
     extent = np.abs(cells[:, :2]).max(0)
     zone = np.clip(((cells[:, :2] / extent + 1) / 2 * ZONES).astype(int), 0, ZONES - 1) @ (1, ZONES)

@@ -22,7 +22,7 @@ from warp_ar.checks.finding import Finding
 from warp_ar.errors import UsageError
 from warp_ar.scene import Camera, Marker, Pose, Probe, Scene
 from warp_ar.scene.pixel_rays import project
-from warp_ar.tracking.markers import printed_cells
+from warp_ar.tracking.markers import pattern_of
 
 Image = NDArray[np.uint8]
 
@@ -189,7 +189,7 @@ def _inside(look: Look, circle: tuple[float, float, float]) -> bool:
 
 def is_printed(marker: Marker, camera: Camera, pose: Pose, circle: tuple[float, float, float]) -> bool:
     """Return True if a circle (x, y, radius) in pixels is inside the picture of the printed marker or board."""
-    outline = project(camera, pose.apply(printed_cells(marker)[3]))
+    outline = project(camera, pose.apply(pattern_of(marker).outline))
     if not np.isfinite(outline).all():
         return False
     x, y, radius = circle

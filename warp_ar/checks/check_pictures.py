@@ -20,7 +20,7 @@ from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, Marker, Pose, Scene
 from warp_ar.scene.pixel_rays import project
 from warp_ar.sources.source import Source
-from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary, pattern_of, printed_cells
+from warp_ar.tracking.markers import Detection, MarkerDetector, find_dictionary, pattern_of
 from warp_ar.tracking.tracking import Tracker, TrackState
 
 Array = NDArray[np.float64]
@@ -374,7 +374,7 @@ def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[
         image: The picture.
         pose: ``camera_from_world``.
     """
-    cells, white, _, _ = printed_cells(marker)
+    cells, white = pattern_of(marker).cells, pattern_of(marker).white
     pixels = project(look.camera, pose.apply(cells))
     inside = ((pixels >= 1) & (pixels <= (look.camera.width - 2, look.camera.height - 2))).all(1)
     x, y = np.round(pixels[inside]).astype(int).T

@@ -16,7 +16,7 @@ from warp_ar.kernels.structs import struct_dtype
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.scene import Marker, Probe, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.tracking.markers import printed_cells
+from warp_ar.tracking.markers import pattern_of
 
 Array = NDArray[np.float64]
 
@@ -90,8 +90,9 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
 def _find_surfaces(scene: _Known, card_only: bool) -> Surfaces:
     """Return the result of ``find_surfaces``, which is cached: edits of virtual objects do not change the arguments."""
     found = _Collector()
-    cells, white, side, outline = printed_cells(scene.marker)
-    low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
+    pattern = pattern_of(scene.marker)
+    cells, white, side = pattern.cells, pattern.white, pattern.side
+    low, high = pattern.outline.min(axis=0)[:2], pattern.outline.max(axis=0)[:2]
     if scene.has_marker:
         z, x = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
         paper = [*cells[white], *_quiet_zone(low, high, side)]

@@ -24,7 +24,7 @@ from warp_ar.photographs.support import Support
 from warp_ar.scene import Camera, Probe, Proxy, Scene
 from warp_ar.scene.pixel_rays import project
 from warp_ar.tracking.card_layout import CARD_MARKER
-from warp_ar.tracking.markers import printed_cells
+from warp_ar.tracking.markers import pattern_of
 
 Array = NDArray[np.float64]
 
@@ -110,7 +110,7 @@ def exposure_by_paper(
     Returns:
         Ratio of the exposures; None if the paper clips or is not visible.
     """
-    cells, white, *_ = printed_cells(CARD_MARKER)
+    cells, white = pattern_of(CARD_MARKER).cells, pattern_of(CARD_MARKER).white
     at = project(camera, support.pose.apply(cells[white])).astype(np.float32)
     codes = np.median(cv2.remap(image, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0], 0)
     if codes.max() >= CLIPPED or codes.min() < 1.0:

@@ -79,12 +79,9 @@ class _Bracketing:
         sparse = _DECODE[image[::8, ::8]]
         if not self._settled:
             self._waited += 1
-            if self._reference is None:
-                self._settled = self._waited > SETTLE_FRAMES
-            else:
-                self._settled = self._shows(sparse)
+            self._settled = self._shows(sparse)
             if not self._settled:
-                if self._reference is not None and self._waited >= MOST_WAIT:
+                if self._waited >= MOST_WAIT:
                     self._give_up(now)
                 return None
         seconds = self.exposures[self._asked]
@@ -125,7 +122,8 @@ class _Bracketing:
         Args:
             sparse: Linear values of every eighth pixel in both directions, (h, w, 3).
         """
-        assert self._reference is not None
+        if self._reference is None:
+            return self._waited > SETTLE_FRAMES
         well = (self._reference > 0.05) & (self._reference < 0.9)
         if well.sum() < 30:
             return self._waited > SETTLE_FRAMES  # too few well exposed pixels to compare

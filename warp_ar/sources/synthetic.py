@@ -46,8 +46,6 @@ class Synthetic(RecordedSource):
         super().__init__(loop=loop)
         if name != "card":
             raise UsageError(f"there is no synthetic source {name!r}; did you mean card?")
-        if min(size) < 1 or length < 1:
-            raise UsageError(f"a synthetic source needs a positive size and length, not {size} and {length}")
         self.name, self.size, self.fps, self.length = name, size, fps, length
         self.description = f"synthetic {name} ({size[0]}x{size[1]}, {length} frames)"
 

@@ -35,7 +35,7 @@ from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.pixel_rays import project
 from warp_ar.scene.pose import Pose
 from warp_ar.sources.deep_frame import DeepFrame
-from warp_ar.tracking.markers import printed_cells
+from warp_ar.tracking.markers import pattern_of
 
 Array = NDArray[np.float64]
 
@@ -282,10 +282,10 @@ def still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.boo
     Returns:
         World points in metres, (n, 3), and masks (n,) of the points on the card's paper and of those on its ink.
     """
-    cells, white, _, outline = printed_cells(scene.marker)
-    low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
+    pattern = pattern_of(scene.marker)
+    low, high = pattern.outline.min(axis=0)[:2], pattern.outline.max(axis=0)[:2]
     margin = 0.3 * float((high - low).max())
-    found, steps = [cells[white], cells[~white]], np.linspace(-0.45, 0.45, GRID)
+    found, steps = [pattern.cells[pattern.white], pattern.cells[~pattern.white]], np.linspace(-0.45, 0.45, GRID)
     for proxy in scene.proxies:
         if proxy.shape != "plane" or proxy.marker is not None:
             continue

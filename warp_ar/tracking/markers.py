@@ -127,8 +127,10 @@ class Pattern:
     """Distance in metres from each point to the nearest parallel border, (m,)."""
     cells: Array
     """Centres of the cells, (c, 3)."""
-    white: Array
-    """1 where a cell is white, 0 where black, (c,)."""
+    white: NDArray[np.bool_]
+    """True where a cell is white, (c,)."""
+    side: float
+    """Side of a cell in metres."""
 
 
 def _cell_edges(
@@ -220,24 +222,9 @@ def pattern_of(marker: Marker) -> Pattern:
         normals=normals @ turned,
         clearances=clearances,
         cells=np.concatenate(centres) @ turned,
-        white=np.concatenate(white).astype(float),
+        white=np.concatenate(white),
+        side=cell,
     )
-
-
-def printed_cells(marker: Marker) -> tuple[Array, NDArray[np.bool_], float, Array]:
-    """Return all cells of a print's markers.
-
-    Args:
-        marker: Marker or board.
-
-    Returns:
-        Centres of all cells (c, 3), mask of white cells (c,), side of a cell in metres, and corners of the whole print
-        (4, 3).
-    """
-    pattern = pattern_of(marker)
-    size = marker.size if marker.board is None else marker.board.marker_length
-    side = size / (int(find_dictionary(marker.dictionary).markerSize) + 2)
-    return pattern.cells, pattern.white > 0.5, side, pattern.outline
 
 
 def _square(x: float, y: float, width: float, height: float) -> Array:

@@ -211,7 +211,10 @@ class Tracker:
         guess = self._predict(time)
         fit = self._measure(image, guess)
         if fit is None:
-            return self._without(guess, time)
+            if guess is None:
+                return _NO_POSE
+            quality = self._quality * (1 - (time - self._time) / self._hold) if self._hold > 0 else 0.0
+            return Track(guess, TrackState.HELD, float(np.clip(quality, 0, 1)), self._outline(guess), np.inf)
         pose, quality = self._steadied(fit, guess, time), self._judge(fit)
         if self._pose is not None:
             elapsed = max(time - self._time, 1e-3)
@@ -250,12 +253,6 @@ class Tracker:
         self._show(image)
         fit = self._fit_detections(found, None)
         return np.inf if fit is None else fit.error
-
-    def _without(self, guess: Pose | None, time: float) -> Track:
-        if guess is None:
-            return Track(None, TrackState.LOST, 0.0, None, np.inf)
-        quality = self._quality * (1 - (time - self._time) / self._hold) if self._hold > 0 else 0.0
-        return Track(guess, TrackState.HELD, float(np.clip(quality, 0, 1)), self._outline(guess), np.inf)
 
     def _predict(self, time: float) -> Pose | None:
         """Return the last pose extrapolated to a time; None without a last pose.
@@ -362,7 +359,8 @@ class Tracker:
             return None
         most = max(_ALIKE * candidates[0][1], candidates[0][1] + _ALIKE_PIXELS)
         alike = [pose for pose, error in candidates if error < most or pose is candidates[0][0]]
-        fits = self._refined(alike, points, corners)
+        fitted = [(pose, self._fitter.fit(pose, _REACH)) for pose in alike]
+        fits = [fit if _holds(fit) else self._fit_corners(pose, points, corners) for pose, fit in fitted]
         good = [fit for fit in fits if fit.pattern >= _PATTERN]
         return self._preferred(good, guess) if good else None
 
@@ -431,11 +429,6 @@ class Tracker:
             return near
         self._evidence = 0.0
         return far
-
-    def _refined(self, poses: list[Pose], points: Array, corners: Array) -> list[Fit]:
-        """Return each pose fitted to the edges, or to the corners if the fit to the edges fails."""
-        found = [(pose, self._fitter.fit(pose, _REACH)) for pose in poses]
-        return [fit if _holds(fit) else self._fit_corners(pose, points, corners) for pose, fit in found]
 
     def _fit_corners(self, pose: Pose, points: Array, corners: Array) -> Fit:
         """Return a pose that was computed from detected corners, with its uncertainty and error.
