@@ -44,34 +44,27 @@ class Driver:
         self._joins: collections.deque[Job] = collections.deque()
 
     def _list_jobs(self) -> Iterator[Job]:
-        """Yield the surveys that are still to be done; open the jobs of clips that are surveyed already."""
+        """Yield the surveys that are still to be done; open the jobs of clips that are surveyed already.
+
+        Raises:
+            UsageError: A file that a survey has read has changed.
+        """
         for clip in range(len(self._jobs.clips)):
             survey = Job("survey", clip)
-            if survey.key(self._jobs) in self._manifest.failed:
+            key = survey.key(self._jobs)
+            if key in self._manifest.failed:
                 continue
             surveyed = self._is_done(survey)
-            if surveyed:
-                self._refuse_changed(survey.key(self._jobs))
+            if surveyed and (told := changed_input(self._manifest.done[key].get("inputs") or {})):
+                raise UsageError(
+                    f"{told}, which {self._folder} was begun with; put it back, or begin a new run in another folder"
+                )
             if self._jobs.dataset is None and self._is_done(Job("join", clip)):
                 continue
             if surveyed:
                 self._open_clip(clip)
             else:
                 yield survey
-
-    def _refuse_changed(self, key: str) -> None:
-        """Check that the files that a survey has read are unchanged.
-
-        Args:
-            key: Key of the survey.
-
-        Raises:
-            UsageError: A file has changed.
-        """
-        if told := changed_input(self._manifest.done[key].get("inputs") or {}):
-            raise UsageError(
-                f"{told}, which {self._folder} was begun with; put it back, or begin a new run in another folder"
-            )
 
     def _is_done(self, job: Job) -> bool:
         """Return True if a job's outputs are complete.

@@ -154,7 +154,6 @@ class ProcessPool(Pool):
         super().__init__(len(devices))
         self._context, self._devices, self._cores = context, devices, cores_of(devices)
         self._executors: dict[int, ProcessPoolExecutor] = {}
-        self._pids: dict[int, int] = {}
         for worker, thread in enumerate(self._threads):
             thread.submit(self._ready, worker)
 
@@ -175,7 +174,7 @@ class ProcessPool(Pool):
                     initargs=(context, self._cores[worker], every),
                 )
             try:
-                self._pids[worker] = self._executors[worker].submit(os.getpid).result()
+                self._executors[worker].submit(os.getpid).result()
                 return self._executors[worker]
             except BrokenExecutor:
                 del self._executors[worker]
@@ -199,10 +198,8 @@ class ProcessPool(Pool):
         return self._context.folder / "log" / f"worker-{worker}.log"
 
     def _end(self) -> None:
-        own = set(self._pids.values())
         for process in multiprocessing.active_children():
-            if process.pid in own:
-                process.kill()
+            process.kill()
         for executor in list(self._executors.values()):
             executor.shutdown(wait=True, cancel_futures=True)
 
