@@ -69,7 +69,7 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
             f"schema = 1\n[run]\ndigests = true\n[[clip]]\n[dataset]\n{BALL}",
             "run.digests = true: the manifest has a digest of",
         ),
-        ("schema = 1\n[[clip]]\n[dataset]\n", "dataset.object is missing: expected at least one"),
+        ("schema = 1\n[[clip]]\n[dataset]\n", "dataset.objects is missing: expected at least one [[dataset.object]]"),
         (f"schema = 1\n[[clip]]\n[dataset]\nlights = [1, 1]\n{BALL}", "dataset.lights = [1, 1]: expected at least one"),
         (
             f"schema = 1\n[[clip]]\n[dataset]\nregion = [0.1, 0, 0, 1]\n{BALL}",

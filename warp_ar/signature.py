@@ -7,6 +7,7 @@ USD, the layer's custom data.
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import re
 import struct
@@ -46,6 +47,14 @@ COMMENT = f"<!-- {PROGRAM} -->"
 """Comment at the start of a chart or a Markdown text, and after the document type of a page."""
 _SOFTWARE_TAG = 0x0131
 """EXIF tag of the software's name."""
+
+
+def installed_version(package: str) -> str:
+    """Return the version of an installed package; a question mark if it is not installed, as in a checkout."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "?"
 
 
 def sign_png(data: bytes) -> bytes:

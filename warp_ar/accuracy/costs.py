@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
 import statistics
 import time
@@ -25,6 +24,7 @@ from warp_ar.engine.switcher import let_go
 from warp_ar.errors import say
 from warp_ar.files import write_whole
 from warp_ar.scene import Pose, Scene
+from warp_ar.signature import installed_version
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import EVERY_FRAME
 from warp_ar.tracking.tracking import Tracker
@@ -225,7 +225,7 @@ def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
         device.name,
         usable_cores() if device.is_cpu else None,
         wp.__version__,
-        package_version(),
+        installed_version("warp-ar"),
         plan.request.size,
         [stage.name for stage, _ in plan.stages],
         [(item.shape, str(item.file), type(item.material).__name__) for item in scene.objects],
@@ -234,14 +234,6 @@ def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
         [(setting.name, setting.methods) for setting in settings],
     ]
     return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:24]
-
-
-def package_version() -> str:
-    """Return the version of this package; ``checkout`` if it is not installed."""
-    try:
-        return importlib.metadata.version("warp-ar")
-    except importlib.metadata.PackageNotFoundError:
-        return "checkout"
 
 
 def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | None:

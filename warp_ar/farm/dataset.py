@@ -201,8 +201,6 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     """
     table = JobTable(label, folder, "dataset", data, _KEYS)
     catalogue = tuple(map(_read_object, _entries(table, "object", (*_OWN_KEYS, *_OBJECT_KEYS))))
-    if not catalogue:
-        table.fail("object", "expected at least one [[dataset.object]]")
     if len({spec.name for spec in catalogue}) < len(catalogue):
         table.fail("object", "two have one name; each is a category of its own")
     kinds = tuple(map(_read_light, _entries(table, "light", _LIGHT_KEYS)))

@@ -12,7 +12,6 @@ import dataclasses
 import functools
 import glob
 import hashlib
-import importlib.metadata
 import itertools
 import re
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from warp_ar.files import is_file, is_folder, parse_toml, read_text
 from warp_ar.output.encoders import CODINGS
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
 from warp_ar.scene.fields import Key, fields_of
+from warp_ar.signature import installed_version
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
 SCHEMA = 1
@@ -405,12 +405,5 @@ def program_version() -> str:
     for folder in (root, root / "kernels"):  # kernels may be a link, which rglob does not follow
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    parts = [f"warp_ar {_version('warp-ar')} {digest.hexdigest()[:12]}"]
-    return ", ".join([*parts, *(f"{name} {_version(name)}" for name in _LIBRARIES)])
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "?"
+    own = f"warp_ar {installed_version('warp-ar')} {digest.hexdigest()[:12]}"
+    return ", ".join([own, *(f"{name} {installed_version(name)}" for name in _LIBRARIES)])

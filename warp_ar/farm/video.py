@@ -180,9 +180,7 @@ def _sound(source: Any, target: Any, zero: float, until: float | None) -> Iterat
     streams = {}
     for stream in source.streams.audio:
         made = target.add_stream_from_template(stream)
-        for name in _LANGUAGES:
-            if name in stream.metadata:
-                made.metadata[name] = stream.metadata[name]
+        made.metadata.update({name: stream.metadata[name] for name in _LANGUAGES if name in stream.metadata})
         streams[stream.index] = made
 
     def packets() -> Iterator[tuple[float, Any]]:
