@@ -122,7 +122,15 @@ def errors_of(radiance: Map, level: float) -> dict[str, float]:
 
 
 def summarise(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Return mean errors over exposures, the share of them that each number makes worse, and quantiles."""
+    """Return the printed figures over all exposures.
+
+    Args:
+        rows: Result of ``errors_of`` for each exposure.
+
+    Returns:
+        ``error``: mean error of each rule, such as ``clipped``. ``worse``: share of the exposures whose error the rule
+        raises above ``WORSE`` times that of the clipped map. ``missing`` and ``allowed``: quantiles of these values.
+    """
     others = ("missing", "allowed")
     means = {key: round(float(np.mean([row[key] for row in rows])), 3) for key in rows[0] if key not in others}
     worse = {

@@ -190,13 +190,14 @@ def measure_set(folder: Path, device: str) -> list[Row]:
 
 
 def summarise(sets: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
-    """Return mean errors of each set and over all sets; a set without photographs is left out.
+    """Return mean errors of each set of photographs, and the means over all sets.
 
     Args:
-        sets: Errors of photographs by the set's name.
+        sets: Errors of the photographs of each set, by the set's name; sets without photographs are left out.
 
     Returns:
-        Means of each set under ``sets``, and the means over these with equal weights, None if there are none.
+        ``sets``: means of each set, by its name and by the error's. The other keys are the names of errors, with the
+        mean over the sets' means; None if there are no sets.
     """
     keys = ("error", "scaled", "clipping", "default", "captured")
     means = {

@@ -127,7 +127,7 @@ def spread_of(values: NDArray[np.float64]) -> float:
 
 
 def summarise(draws: Sequence[Measures]) -> dict[str, float]:
-    """Return figures over all draws of a case, percent, without those that were not measured."""
+    """Return the figures that the module lists, in percent, over all runs of a case; NaN figures are left out."""
     light, picture, power = 100.0 * np.array(draws).T
     low, high = np.quantile(light, (0.1, 0.9))
     figures = {"mean": light.mean(), "p10": low, "p90": high, "spread": spread_of(light), "picture": spread_of(picture)}

@@ -111,7 +111,10 @@ def _choose_camera(rng: np.random.Generator, ball: Array, radius: float) -> tupl
 
 
 def _choose_texture(rng: np.random.Generator, size: int = 512) -> tuple[NDArray[np.float32], float]:
-    """Return the reflectance of a table, (size, size, 3), and the standard deviation of its logarithm."""
+    """Return a random texture of a table, (size, size, 3), and the strength of its pattern.
+
+    The texture holds reflectances. The strength is about the standard deviation of their logarithm; 0 means one colour.
+    """
     amplitude = float(rng.choice([0.0, 0.05, 0.15, 0.35]))
     noise = np.zeros((size, size), np.float32)
     for scale in (4, 16, 64):

@@ -119,7 +119,7 @@ def capture_light(
         device: ``auto``, ``cpu`` or ``cuda:N``.
         height: Rows of the map; None: chosen by the ball's size in pixels.
         raises: Whether clipped light of a single photograph is raised by the least amount that the clipping prior
-            expects (``light/least_missing.py``).
+            expects (``light/priors.py``).
         chart: Photograph of a colour chart by the same camera with the same white balance, of ``paths`` or another: the
             light is in linear sRGB by it, and in camera values times its ``colors``. None: the light is in camera
             values.
@@ -509,10 +509,19 @@ def _place(
     sphere: Array,
     turn: Array,
 ) -> tuple[NDArray[Any], Pose]:
-    """Return a photograph's window around its ball, and the pose that puts the ball there.
+    """Return the part of a photograph around its ball, and a pose that places the ball where this part shows it.
 
-    A photograph's displacement against the shown one becomes a displacement of the ball before the camera, so that no
-    pixel is resampled.
+    The ball may be displaced against the shown photograph, whose camera values the light has. The part is moved by
+    whole pixels, and the rest of the displacement becomes a movement of the ball, so that no pixel is resampled.
+
+    Args:
+        bracket: Photographs of the bracket, with the circles of their balls.
+        k: Index of the photograph.
+        own: Circle of the ball in the shown photograph.
+        window: Left column, top row and side in pixels of the part of the shown photograph.
+        camera: Camera of the shown photograph.
+        sphere: Centre of the ball in the shown photograph's camera frame, in radii of the ball, (3,).
+        turn: Rotation from the light's axes to the camera's, (3, 3).
     """
     x0, y0, side = window
     x, y, radius = bracket.circles[k]

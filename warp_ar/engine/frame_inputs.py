@@ -388,10 +388,10 @@ class FrameInputs:
         return before != (position.tobytes(), rotation.tobytes())
 
     def _outlines(self) -> dict[str, Outline]:
-        """Return the outlines in the world to project onto the screen, by the names of their rectangles.
+        """Return world-space outlines, each under the name of the screen rectangle that is to enclose its projection.
 
-        ``direct`` bounds the direct light of virtual lights. ``light`` is included only if bounced light reaches
-        further.
+        ``direct`` bounds the direct light of virtual lights. ``light`` also bounds the light that lit surfaces reflect;
+        without such light it is left out, and the rectangle of ``direct`` serves instead.
         """
         scene, arrays = self.host_scene, self._arrays
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}

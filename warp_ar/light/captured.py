@@ -256,13 +256,17 @@ def irradiance_above(radiance: Map) -> Array:
 def find_emitters(
     radiance: Map, clipped: Map, error: float, captured: Map | None = None
 ) -> tuple[CapturedEmitter, ...]:
-    """Return the bright sources of a map, the most powerful first.
+    """Return at most ``MOST_EMITTERS`` bright sources of a map, the most powerful first.
+
+    A source is a connected set of texels that are brighter than ``BRIGHT`` times the map's mean, or more than half
+    clipped in a channel. Sources with less than ``LEAST_SHARE`` of the map's light are left out.
 
     Args:
-        radiance: Latlong map, (height, 2 height, 3).
-        clipped: Share of each texel that clips in every exposure, (height, 2 height, 3).
-        error: Relative error of radiance that does not clip.
-        captured: Map without recovered light, which gives the lower ends of intervals; None: ``radiance``.
+        radiance: Latlong map, (height, 2 height, 3), with estimated radiance where it clips.
+        clipped: Share of each texel that clips in every exposure, by channel, (height, 2 height, 3).
+        error: Relative error of radiance that does not clip; sets the width of the powers' intervals.
+        captured: Map with clipped radiance as captured, from which the lower ends of the intervals are computed;
+            None: ``radiance``.
     """
     captured = radiance if captured is None else captured
     height = len(radiance)

@@ -26,7 +26,12 @@ class RunLog:
     """Log of poses and timings, frame by frame."""
 
     def __init__(self, pipeline: Any) -> None:
-        """``pipeline`` is a ``Pipeline``, or an ``AutoPipeline``, which has a ``status`` of what it chose."""
+        """Begin a log without frames.
+
+        Args:
+            pipeline: ``Pipeline`` that lights the frames, or ``AutoPipeline``. The report also contains the latter's
+                ``status``: the methods that it chose, with expected and measured times.
+        """
         self._pipeline = pipeline
         self._frames: list[dict[str, Any]] = []
         self._skipped: Counter[str] = Counter()

@@ -81,7 +81,10 @@ class Table:
         return measure_reflectance(self._scene(), self.camera, self.probe, view, self.table)
 
     def reflectance_under(self, irradiance: Array) -> float:
-        """Return the reflectance of the table's brightest part under irradiance (3,); 0 if too little is visible."""
+        """Return the reflectance that the table's brightest part must have if it receives ``irradiance``, (3,).
+
+        It is the mean of the channels, or 0 if fewer than ``FEWEST`` points of the table around the ball are visible.
+        """
         angle, away = np.meshgrid(np.arange(48) * np.pi / 24, np.linspace(*REACH, 16))
         x, y, _ = self.probe.center
         away = self.probe.radius * away.ravel()

@@ -98,12 +98,15 @@ class SceneTable(Table):
 
 
 def read_fields(table: SceneTable, kind: type[_T], **given: Any) -> _T:
-    """Read a table into its dataclass, which checks the values.
+    """Return an instance of a dataclass with the values of a scene file's table.
+
+    If the dataclass has ``USES``, its first field selects a variant, such as the shape of an object. ``USES`` lists the
+    keys of each variant; other keys are refused.
 
     Args:
-        table: The table; keys that its kind does not use are refused.
-        kind: The dataclass.
-        given: Values of fields that are not read from the table.
+        table: The table; keys that it lacks keep the defaults of their fields.
+        kind: The dataclass, whose fields declare the keys and which checks the values.
+        given: Values of fields that are not read from the table, by the names of the fields.
 
     Raises:
         SceneError: A value is missing or not allowed.
