@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import math
 import re
 import struct
@@ -37,6 +36,7 @@ class GltfFile:
 
         Raises:
             SceneError: The file is incomplete, too large, or violates glTF. All methods raise it for these reasons.
+            ValueError: The header is not UTF-8, or data in it are not base64; `mesh_files` names the file.
         """
         self.source = source
         path, data = source.path, source.data
@@ -44,13 +44,7 @@ class GltfFile:
         tree, binary = self._split_glb(data) if is_binary else (data, b"")
         if len(tree) > limits().text_bytes and is_binary:
             raise SceneError(too_much(f"{path}: its header", len(tree), "bytes", "text_bytes"))
-        try:
-            text = tree.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise SceneError(
-                f"{path}: the mesh cannot be read; is the file whole? (byte {error.start} is no UTF-8)"
-            ) from error
-        header = parse_json(text, f"{path}: its header", SceneError)
+        header = parse_json(tree.decode("utf-8-sig"), f"{path}: its header", SceneError)
         if not isinstance(header, dict):
             self.fail("its header is no JSON object")
         self.header: dict[str, Any] = header
@@ -158,10 +152,7 @@ class GltfFile:
             if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", uri):
                 self.fail(f"the URI {uri[:60]!r} is not beside it; nothing is fetched: save the file there")
             return self.source.get(unquote(uri), "mesh_bytes")
-        try:
-            return base64.b64decode(uri.partition("base64,")[2])
-        except binascii.Error as error:
-            raise SceneError(f"{self.source.path}: the mesh cannot be read: a URI holds no base64 ({error})") from error
+        return base64.b64decode(uri.partition("base64,")[2])
 
     def image(self, index: int) -> bytes:
         """Return the bytes of an embedded or referenced picture."""
