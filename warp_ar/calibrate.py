@@ -39,7 +39,7 @@ from warp_ar.errors import UsageError, say
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import CharucoBoard, Marker, load_scene, loads_scene
 from warp_ar.scene.description import INTRINSICS
-from warp_ar.scene.starter import amend_scene, guesses
+from warp_ar.scene.starter import amend_scene, camera_guess
 from warp_ar.sources.sources import open_source, source_of
 from warp_ar.tracking.card_layout import CARD_MARKER
 
@@ -167,7 +167,7 @@ def _run_ball(options: argparse.Namespace) -> int:
         count = min(source.length or options.frames, options.frames)
         looked = "the only frame" if count == 1 else f"the first {count} frames"
         raise UsageError(f"{spec}: no marker in {looked}; see [marker] in {options.scene}")
-    for guess in guesses(scene):
+    if guess := camera_guess(scene):
         say(f"{guess}; until then the results are no better than this guess")
     views, code = views[:: -(-len(views) // 12)], EXIT_DONE
     say(f"measuring the ball in {len(views)} frames, which takes some seconds")

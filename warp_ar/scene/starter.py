@@ -103,16 +103,15 @@ def key_comment(section: str, name: str) -> list[str]:
     return [f"# {line}" for line in textwrap.wrap(key.description, _WIDTH)]
 
 
-def guesses(scene: Scene) -> list[str]:
-    """Return the assumed values of a scene, one line each, with the command that measures the value."""
-    found = []
-    if (field := scene.camera.field_of_view) is not None:
-        where = "" if scene.path is None else f" --write {scene.path.parent}"
-        found.append(
-            f"the camera is guessed, with a field of view of {field:g} degrees; "
-            f"python -m warp_ar.calibrate camera PICTURES{where} measures it"
-        )
-    return found
+def camera_guess(scene: Scene) -> str:
+    """Return that a scene's camera is guessed, and the command that measures it; empty if it is not guessed."""
+    if (field := scene.camera.field_of_view) is None:
+        return ""
+    where = "" if scene.path is None else f" --write {scene.path.parent}"
+    return (
+        f"the camera is guessed, with a field of view of {field:g} degrees; "
+        f"python -m warp_ar.calibrate camera PICTURES{where} measures it"
+    )
 
 
 def amend_scene(
