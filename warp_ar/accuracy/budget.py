@@ -22,20 +22,8 @@ from typing import Any
 import warp as wp
 
 from warp_ar.accuracy.controller import Controller
-from warp_ar.accuracy.cost_table import (
-    chosen,
-    load_errors,
-    relevant_settings,
-    turn,
-)
-from warp_ar.accuracy.costs import (
-    BASE,
-    Costs,
-    cost_key,
-    measure_costs,
-    read_costs,
-    write_costs,
-)
+from warp_ar.accuracy.cost_table import chosen, load_errors, relevant_settings, turn
+from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_costs, read_costs, write_costs
 from warp_ar.cache_folder import cache_folder
 from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress

@@ -18,12 +18,7 @@ from warp_ar.stages import base
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.environment_sets import METHODS, Method, lists_texels, sample_names, sample_slots
-from warp_ar.stages.shared.lighting import (
-    distant_light_reads,
-    distant_variant,
-    make_distant_light,
-    make_other_balls,
-)
+from warp_ar.stages.shared.lighting import distant_light_reads, distant_variant, make_distant_light, make_other_balls
 from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 

@@ -18,11 +18,7 @@ from warp_ar.scene.object_materials import reflects_glossily, scene_materials
 from warp_ar.stages import base
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.lighting import (
-    distant_light_reads,
-    distant_variant,
-    make_distant_light,
-)
+from warp_ar.stages.shared.lighting import distant_light_reads, distant_variant, make_distant_light
 from warp_ar.stages.shared.picture import find_picture, find_visible, frame_reads
 
 SIDE = 4

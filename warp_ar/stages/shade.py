@@ -14,12 +14,7 @@ from warp_ar.stages import base
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
-from warp_ar.stages.shared.lighting import (
-    distant_light_reads,
-    make_distant_light,
-    shade_config,
-    shade_variant,
-)
+from warp_ar.stages.shared.lighting import distant_light_reads, make_distant_light, shade_config, shade_variant
 from warp_ar.stages.shared.picture import GrowingRows, find_visible
 
 
