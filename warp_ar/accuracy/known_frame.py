@@ -6,12 +6,13 @@ import dataclasses
 import functools
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.accuracy.light_places import place_emitters
-from warp_ar.accuracy.path_tracer import LIGHT_SAMPLES, Image, PathTracer
+from warp_ar.accuracy.path_tracer import Image, PathTracer
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
@@ -46,28 +47,11 @@ class KnownFrame:
     balls: int = 1
     """Number of mirror balls between which the pipeline interpolates light; ``light`` is that at the first one."""
 
-    def tracer(
-        self,
-        *,
-        device: str = "auto",
-        size: tuple[int, int] | None = None,
-        seed: int = 0,
-        light_samples: int = LIGHT_SAMPLES,
-    ) -> PathTracer:
+    def tracer(self, **options: Any) -> PathTracer:
         """Return a path tracer of this frame; the arguments are those of ``PathTracer``."""
         if self.balls > 1:
             _tell_first(self.scene.name, self.balls)
-        return PathTracer(
-            self.scene,
-            self.light,
-            self.image,
-            self.pose,
-            device=device,
-            size=size,
-            seconds=self.seconds,
-            seed=seed,
-            light_samples=light_samples,
-        )
+        return PathTracer(self.scene, self.light, self.image, self.pose, seconds=self.seconds, **options)
 
     def placed(self, *, device: str = "auto") -> KnownFrame:
         """Return this frame with estimated distances of its light's emitters, or unchanged if a distance was known.
