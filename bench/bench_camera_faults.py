@@ -42,7 +42,7 @@ import cv2
 import flip_evaluator
 import numpy as np
 
-from tests.simulated_camera import ALONE, Faults, decode_srgb, expose, faults_named
+from bench.simulated_camera import ALONE, Faults, decode_srgb, expose, faults_named
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.scene import SourceSpec, load_scene
 from warp_ar.session import Session

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from bench.bench_camera_faults import QUALITY, TRUTH, irradiance, light_of
-from tests.simulated_camera import Faults, expose
+from bench.simulated_camera import Faults, expose
 from warp_ar import Pipeline
 from warp_ar.scene import load_scene
 

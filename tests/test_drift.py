@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.simulated_camera import decode_srgb
 from warp_ar import Pipeline
 from warp_ar.scene import Pose, Scene, loads_scene
 from warp_ar.sources.deep_frame import DeepFrame
+from warp_ar.srgb import decode_srgb
 from warp_ar.tracking.drift import CONTRASTS, ExposureDrift
 from warp_ar.tracking.markers import pattern_of
 
@@ -147,7 +147,7 @@ def test_virtual_lights_keep_their_value_while_the_exposure_moves():
         lit = []
         for index, gain in enumerate((1.0, 0.6)):
             result = pipeline(encode(picture * gain), pose=POSE, time_seconds=index / 60)
-            lit.append(decode_srgb(cv2.blur(result.image, (5, 5))) / gain)
+            lit.append(decode_srgb(cv2.blur(result.image, (5, 5)) / 255.0) / gain)
     added = [part - picture for part in lit]
     table = (slice(10, 30), slice(60, 100))
     assert added[0][table].mean() > 0.05
@@ -163,7 +163,7 @@ def test_virtual_lights_are_as_bright_as_the_level_at_which_the_camera_saturates
             pipeline.inputs.fix_saturation(np.full(3, float(level)))
             pipeline(picture, pose=POSE)
             shone = pipeline.inputs.block.host("lights")["intensity"][0]
-            np.testing.assert_allclose(shone, 0.5 * decode_srgb(np.array([level]))[0], rtol=1e-6)  # float32
+            np.testing.assert_allclose(shone, 0.5 * decode_srgb(np.array([level]) / 255.0)[0], rtol=1e-6)  # float32
 
 
 def test_light_that_dims_on_all_surfaces_is_light_unless_the_camera_meters_by_itself() -> None:
@@ -178,6 +178,6 @@ def test_light_that_dims_on_all_surfaces_is_light_unless_the_camera_meters_by_it
         with Pipeline(scene, device="cpu", quality="low") as pipeline:
             for index, gain in enumerate((1.0, 0.6)):
                 result = pipeline(encode(picture * gain), pose=POSE, time_seconds=0.2 * index)
-        added[metering] = (decode_srgb(cv2.blur(result.image, (5, 5))) - 0.6 * picture)[table].mean()
+        added[metering] = (decode_srgb(cv2.blur(result.image, (5, 5)) / 255.0) - 0.6 * picture)[table].mean()
     # Not by the whole gain: in a darker frame the table is taken to reflect less.
     assert added["fixed"] > 1.3 * added["automatic"]
