@@ -128,7 +128,7 @@ class Lighter(Closing):
                     if follows and (key := survey.key_of(frame.index)) != last:
                         pipeline.take_light(*survey.light(key))
                         last = key
-                    result = _call(pipeline)(frame.deepest, time_seconds=frame.time, pose=pose)
+                    result = pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
                 yield Lit(frame, pose, result, pipeline)
 
     def _light_alone(self, job: Job, outputs: tuple[str, ...]) -> Iterator[Lit]:
@@ -147,7 +147,7 @@ class Lighter(Closing):
             pipeline.start_clock(0.0)
             for frame in source:
                 pose = given_pose(own.pose, frame)
-                result = _call(pipeline)(frame.deepest, time_seconds=frame.time, pose=pose)
+                result = pipeline.submit(frame.deepest, time_seconds=frame.time, pose=pose)
                 if frame.index >= job.first:
                     yield Lit(frame, None, result, pipeline)
 
@@ -185,11 +185,3 @@ class Lighter(Closing):
             self._pipelines.popitem(last=False)[1].close()
             gc.collect()  # large arrays are part of reference cycles
         return pipeline
-
-
-def _call(pipeline: Pipeline) -> Any:
-    """Return the function that lights a frame.
-
-    It is ``submit``, which does not wait for the result, if only pictures are requested; else the pipeline itself.
-    """
-    return pipeline.submit if pipeline.plan.request.outputs == ("image",) else pipeline
