@@ -10,7 +10,7 @@ import pytest
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar.accuracy import cases, measure
 from warp_ar.accuracy.cost_table import SETTINGS
-from warp_ar.sources.sources import Frame
+from warp_ar.sources.source import Frame
 from warp_ar.tracking.tracking import Tracker
 
 

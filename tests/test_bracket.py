@@ -25,7 +25,7 @@ from warp_ar.kernels.structs import make_environment_view
 from warp_ar.scene import Camera, Marker, MirrorMaterial, Object, Pose, PoseSpec, Probe, Proxy, Scene
 from warp_ar.session import Session
 from warp_ar.sources.exposures import MOST_EXPOSURES, find_exposure, plan_bracket
-from warp_ar.sources.sources import Synthetic
+from warp_ar.sources.synthetic import Synthetic
 from warp_ar.stages.quality import PRESETS
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,7 @@ import pytest
 from tests.test_sources import PATIENCE, error_of, grey, no_thread_left, take_until_error  # noqa: F401  (a fixture)
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.sources import capture_device
-from warp_ar.sources.sources import CaptureDevice
+from warp_ar.sources.capture_device import CaptureDevice
 
 pytestmark = pytest.mark.slow
 

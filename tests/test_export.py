@@ -39,7 +39,7 @@ def clip(tmp_path: pathlib.Path) -> pathlib.Path:
     """A scene whose frames lie in a folder."""
     import cv2
 
-    from warp_ar.sources.sources import Synthetic
+    from warp_ar.sources.synthetic import Synthetic
 
     frames = tmp_path / "frames"
     frames.mkdir()

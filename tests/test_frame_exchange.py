@@ -15,7 +15,7 @@ from tests.test_pipeline import SIZE, make_scene
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
-from warp_ar.sources.sources import Synthetic
+from warp_ar.sources.synthetic import Synthetic
 
 WIDTH, HEIGHT = SIZE
 

@@ -24,7 +24,7 @@ from warp_ar.output.environment_file import read_environment
 from warp_ar.output.places import folder_to_oneself
 from warp_ar.scene import Marker, Pose, load_scene
 from warp_ar.scene.description import CharucoBoard
-from warp_ar.sources.sources import Synthetic
+from warp_ar.sources.synthetic import Synthetic
 
 pytestmark = pytest.mark.slow
 

@@ -30,7 +30,7 @@ from warp_ar.scene import (
     Proxy,
     Scene,
 )
-from warp_ar.sources.sources import Synthetic
+from warp_ar.sources.synthetic import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.tracking import Tracker, TrackState
 

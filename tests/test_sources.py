@@ -22,8 +22,8 @@ from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.sources import video_file
-from warp_ar.sources.source import FRAMES_AHEAD
-from warp_ar.sources.sources import QueueSource, Source, open_source
+from warp_ar.sources.source import FRAMES_AHEAD, QueueSource, Source
+from warp_ar.sources.sources import open_source
 from warp_ar.sources.video_file import _IN_PLANES, TO_RGB, rgb_from_video
 
 # 4:2:0 at limited range keeps 219 of 255 levels, and the codec adds its own rounding.

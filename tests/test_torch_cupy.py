@@ -14,7 +14,7 @@ import warp as wp
 
 from tests.test_pipeline import SIZE, make_scene
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.sources.sources import Synthetic
+from warp_ar.sources.synthetic import Synthetic
 
 pytestmark = pytest.mark.slow
 

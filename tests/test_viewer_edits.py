@@ -13,7 +13,7 @@ import pytest
 from tests.viewer_rig import SIZE, page_scene
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.scene import Camera, Exposure, Light, MirrorMaterial, PhongMaterial, Proxy, bundled_scenes, load_scene
-from warp_ar.sources.sources import Synthetic
+from warp_ar.sources.synthetic import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.tracking.card_layout import CARD_MARKER
 from warp_ar.viewer import edits

@@ -18,7 +18,8 @@ from tests.viewer_rig import PATIENCE, SIZE, Running, jpeg, page_scene
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.scene import Animation, Object, Play, loads_scene
-from warp_ar.sources.sources import QueueSource, Synthetic
+from warp_ar.sources.source import QueueSource
+from warp_ar.sources.synthetic import Synthetic
 from warp_ar.viewer.controls import Feed
 from warp_ar.viewer.lighting import FIRST, Lighting, make_target
 from warp_ar.viewer.protocol import Command, Picture, ProtocolError

@@ -14,7 +14,7 @@ import pytest
 from tests.test_viewer_budget import known_errors  # noqa: F401  (a fixture)
 from tests.viewer_rig import PATIENCE, SIZE, Running, page_scene, run, served
 from warp_ar.errors import UsageError
-from warp_ar.sources.sources import Synthetic
+from warp_ar.sources.synthetic import Synthetic
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import setup as setup_checks
 from warp_ar.viewer.controls import BrowserCamera, Controls, Feed, guessed_camera

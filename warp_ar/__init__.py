@@ -41,7 +41,8 @@ if TYPE_CHECKING:
         load_scene as load_scene,
     )
     from warp_ar.session import Session as Session
-    from warp_ar.sources.sources import Frame as Frame, open_source as open_source
+    from warp_ar.sources.source import Frame as Frame
+    from warp_ar.sources.sources import open_source as open_source
     from warp_ar.stages.quality import PRESETS as PRESETS, Quality as Quality
     from warp_ar.stages.request import LAYERS as LAYERS
     from warp_ar.tracking.tracking import Tracker as Tracker, TrackState as TrackState
@@ -59,7 +60,8 @@ _HOMES = {
     "session": ("Session",),
     "output.environment_file": ("read_environment", "write_environment"),
     "output.sinks": ("open_sink",),
-    "sources.sources": ("Frame", "open_source"),
+    "sources.source": ("Frame",),
+    "sources.sources": ("open_source",),
     "tracking.tracking": ("TrackState", "Tracker"),
 }
 _RENAMED: dict[str, str] = {}

@@ -29,7 +29,8 @@ from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
 from warp_ar.scene.exif import camera_by_exif
 from warp_ar.sources.deep_frame import check_linear
 from warp_ar.sources.exposures import plan_bracket
-from warp_ar.sources.sources import Frame, Source, open_scene_source
+from warp_ar.sources.source import Frame, Source
+from warp_ar.sources.sources import open_scene_source
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, Quality
 from warp_ar.tracking.markers import tell_upright
 from warp_ar.tracking.tracking import given_pose, tell_missing_poses

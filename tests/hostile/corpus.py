@@ -28,7 +28,9 @@ from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.pose_file import load_pose_file
 from warp_ar.scene.shapes import torus_mesh
 from warp_ar.scene.textures import load_texture
-from warp_ar.sources.sources import FrameFolder, Synthetic, open_source
+from warp_ar.sources.frame_folder import FrameFolder
+from warp_ar.sources.sources import open_source
+from warp_ar.sources.synthetic import Synthetic
 
 SCENE = """schema = 1
 name = "small"

@@ -19,7 +19,8 @@ from warp_ar.engine.graph import make_plan
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
-from warp_ar.sources.sources import Frame, open_source
+from warp_ar.sources.source import Frame
+from warp_ar.sources.sources import open_source
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 from warp_ar.tracking.tracking import Tracker

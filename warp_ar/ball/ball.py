@@ -43,7 +43,7 @@ from warp_ar.ball.surface_rays import dot, nearest_shape, shapes_of
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene
 from warp_ar.scene.pixel_rays import project, undistorted
-from warp_ar.sources.sources import Source
+from warp_ar.sources.source import Source
 from warp_ar.tracking.tracking import Tracker, TrackState
 
 Array = NDArray[np.float64]

@@ -20,24 +20,9 @@ from warp_ar.scene import Scene
 from warp_ar.sources.capture_device import CaptureDevice
 from warp_ar.sources.frame_folder import IMAGE_SUFFIXES, FrameFolder
 from warp_ar.sources.network_stream import SCHEMES, NetworkStream
-from warp_ar.sources.source import DEFAULT_FPS, Frame, QueueSource, Source, check_exposures, check_fps, existing_path
+from warp_ar.sources.source import DEFAULT_FPS, Source, check_exposures, check_fps, existing_path
 from warp_ar.sources.synthetic import Synthetic
 from warp_ar.sources.video_file import VideoFile
-
-__all__ = [
-    "CaptureDevice",
-    "Frame",
-    "FrameFolder",
-    "NetworkStream",
-    "QueueSource",
-    "Source",
-    "Synthetic",
-    "VideoFile",
-    "open_scene_source",
-    "open_source",
-    "source_of",
-]
-
 
 MOST_INDEX = 1023
 """Largest index of a capture device."""

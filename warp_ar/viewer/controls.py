@@ -23,8 +23,8 @@ from warp_ar.checks.finding import Finding
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.pictures import decode_picture
 from warp_ar.scene import Camera, Scene
-from warp_ar.sources.source import Frame, Source
-from warp_ar.sources.sources import MOST_INDEX, QueueSource, open_scene_source, source_of
+from warp_ar.sources.source import Frame, QueueSource, Source
+from warp_ar.sources.sources import MOST_INDEX, open_scene_source, source_of
 from warp_ar.viewer import protocol
 from warp_ar.viewer.edits import Wanted, wanted_record
 from warp_ar.viewer.protocol import Notify

@@ -22,7 +22,7 @@ from warp_ar.errors import SourceError, UsageError, WarpArError
 from warp_ar.scene import Camera, Pose, Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.scene.object_shapes import object_shapes
 from warp_ar.signature import encode_png
-from warp_ar.sources.sources import Frame, Source
+from warp_ar.sources.source import Frame, Source
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.tracking.tracking import TrackState, given_pose, tell_missing_poses
 from warp_ar.viewer import edits

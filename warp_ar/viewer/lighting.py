@@ -26,7 +26,7 @@ from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import WarpArError
 from warp_ar.output.report import left_out, stage_names
 from warp_ar.sources.exposures import plan_bracket
-from warp_ar.sources.sources import Frame
+from warp_ar.sources.source import Frame
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
