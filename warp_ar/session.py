@@ -27,7 +27,6 @@ from warp_ar.light.card_light import light_by_card
 from warp_ar.output.environment_file import write_environment
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
 from warp_ar.scene.exif import camera_by_exif
-from warp_ar.sources.deep_frame import check_linear
 from warp_ar.sources.exposures import plan_bracket
 from warp_ar.sources.source import Frame, Source
 from warp_ar.sources.sources import open_scene_source
@@ -200,11 +199,8 @@ class Session(Closing):
 
     def _open(self, scene: Scene, **given: Any) -> Pipeline:
         """Return a pipeline of a fixed quality."""
-        source = self.source
-        if source.deep == "light":
-            check_linear(str(scene.camera.transfer))
-        source.keeps_depth = linear = source.deep != ""
-        return Pipeline(scene, estimates="real_time" if source.live else "synchronous", linear=linear, **given)
+        linear = self.source.keep_depth(str(scene.camera.transfer))
+        return Pipeline(scene, estimates="real_time" if self.source.live else "synchronous", linear=linear, **given)
 
     @property
     def bracket_notes(self) -> tuple[str, ...]:

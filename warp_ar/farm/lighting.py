@@ -19,7 +19,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.farm.frames import open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
-from warp_ar.farm.survey import Survey, keep_depth, lit_scene
+from warp_ar.farm.survey import Survey, lit_scene
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import skeleton
 from warp_ar.sources.deep_frame import DeepFrame
@@ -140,9 +140,7 @@ class Lighter(Closing):
         first, _ = lit_range(self._jobs.clips[job.clip], self.survey(job.clip).index.length)
         with (
             contextlib.closing(self._open(job, max(first, job.first - self._jobs.settings.preroll))) as source,
-            Pipeline(
-                own, linear=keep_depth(source, own), size=source.size, outputs=outputs, **self._options()
-            ) as pipeline,
+            Pipeline(own, **self._options(own, source, outputs)) as pipeline,
         ):
             pipeline.start_clock(0.0)
             for frame in source:
@@ -157,9 +155,11 @@ class Lighter(Closing):
         gpu = self._jobs.settings.gpu_of(self._device)
         return open_part(path, self.survey(job.clip).index, first, job.end, fps, gpu)
 
-    def _options(self) -> dict[str, Any]:
-        """Return the arguments of ``Pipeline`` that are equal for all jobs."""
-        return {"device": self._device, "quality": self._jobs.settings.quality, "estimates": "synchronous"}
+    def _options(self, scene: Scene, source: RecordedSource, outputs: tuple[str, ...]) -> dict[str, Any]:
+        """Return arguments of ``Pipeline`` for a scene, the source of its frames, and outputs."""
+        linear = source.keep_depth(str(scene.camera.transfer))
+        own = {"device": self._device, "quality": self._jobs.settings.quality, "estimates": "synchronous"}
+        return {**own, "size": source.size, "outputs": outputs, "linear": linear}
 
     def _pipeline_for(
         self, scene: Scene, source: RecordedSource, outputs: tuple[str, ...], *, follows: bool
@@ -172,14 +172,13 @@ class Lighter(Closing):
             outputs: Outputs of the pipeline.
             follows: True if each frame is lit with a map of the survey.
         """
-        size, linear = source.size, keep_depth(source, scene)
-        key = skeleton(scene), size, outputs, follows, linear
+        options = self._options(scene, source, outputs)
+        key = skeleton(scene), source.size, outputs, follows, options["linear"]
         pipeline = self._pipelines.pop(key, None)
         if pipeline is not None:
             pipeline.change(scene)
         else:
-            how: dict[str, Any] = {"size": size, "outputs": outputs, "linear": linear, "emitters": follows}
-            pipeline = Pipeline(scene, follows_camera=False, **how, **self._options())
+            pipeline = Pipeline(scene, follows_camera=False, emitters=follows, **options)
         self._pipelines[key] = pipeline
         while len(self._pipelines) > PIPELINES:
             self._pipelines.popitem(last=False)[1].close()

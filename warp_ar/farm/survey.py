@@ -50,7 +50,6 @@ from warp_ar.farm.manifest import describe_inputs
 from warp_ar.kernels.structs import Emitter, struct_dtype
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
-from warp_ar.sources.deep_frame import check_linear
 from warp_ar.sources.source import RecordedSource
 from warp_ar.stages.features import has_environment
 from warp_ar.tracking.tracking import given_pose
@@ -257,7 +256,6 @@ def _look_at_frames(
         captures: True to measure the light.
     """
     with ThreadPoolExecutor(1, "warp_ar-survey") as packer:
-        linear = keep_depth(source, scene)
         pipeline = Pipeline(
             scene,
             device=device,
@@ -266,7 +264,7 @@ def _look_at_frames(
             outputs=("pose", "environment") if captures else ("pose",),
             estimates="synchronous",
             follows_camera=False,
-            linear=linear,
+            linear=source.keep_depth(str(scene.camera.transfer)),
         )
         waiting: collections.deque[Future[None]] = collections.deque()
         with pipeline:
@@ -280,18 +278,6 @@ def _look_at_frames(
             for future in waiting:
                 future.result()
             look.saturation = pipeline.inputs.saturation.levels
-
-
-def keep_depth(source: RecordedSource, scene: Scene) -> bool:
-    """Make a source yield deep frames if its pictures have more than 8 bits, and return True if they have.
-
-    Raises:
-        UsageError: The pictures are linear, which does not fit the camera's transfer function.
-    """
-    if source.deep == "light":
-        check_linear(str(scene.camera.transfer))
-    source.keeps_depth = source.deep != ""
-    return source.keeps_depth
 
 
 def _rounded(values: Map) -> Map:

@@ -28,7 +28,7 @@ from warp_ar.closing import Closing
 from warp_ar.declared import check_fields
 from warp_ar.errors import SourceError, UsageError, reason, warn_renamed
 from warp_ar.files import kind_of
-from warp_ar.sources.deep_frame import DeepFrame
+from warp_ar.sources.deep_frame import DeepFrame, check_linear
 
 Image = npt.NDArray[np.uint8]
 
@@ -133,6 +133,20 @@ class Source(Closing):
         """Return an array for a picture of that size from ``memory``; None if the source must allocate one."""
         given = None if self.memory is None else self.memory()
         return given if given is not None and given.shape == (height, width, 3) else None
+
+    def keep_depth(self, transfer: str) -> bool:
+        """Yield deep frames if the pictures have more than 8 bits, and return True if they have.
+
+        Args:
+            transfer: Transfer function of the camera.
+
+        Raises:
+            UsageError: The pictures are linear, which does not fit the camera's transfer function.
+        """
+        if self.deep == "light":
+            check_linear(transfer)
+        self.keeps_depth = self.deep != ""
+        return self.keeps_depth
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
