@@ -94,6 +94,7 @@ def test_poses_come_back() -> None:
         np.testing.assert_allclose(lamp.world_from_object[:3, :3], 3.0 * UPRIGHT[:3, :3], atol=1e-6)
         lamp.value = dataclasses.replace(lamp.value, radius=0.01)
         assert pipeline.scene.objects[0].radius == 0.01
+        assert pipeline.objects[np.int64(1)].value == named().objects[1]
 
 
 def flat(corners: np.ndarray) -> Object:
@@ -178,11 +179,6 @@ def test_an_edit_that_cannot_be_changes_nothing(edit, error, told, frames: Frame
 def test_a_pipeline_names_what_it_cannot_take(given, told) -> None:
     with pytest.raises(UsageError, match=told):
         Pipeline(**{"scene": make_scene(), "device": "cpu", **given})
-
-
-def test_numbers_of_numpy_find_objects() -> None:
-    with Pipeline(named(), device="cpu", quality="paper") as pipeline:
-        assert pipeline.objects[np.int64(1)].value == named().objects[1]
 
 
 def test_names_are_kept_in_files() -> None:
