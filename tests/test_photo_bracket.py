@@ -175,9 +175,6 @@ def test_a_picture_of_another_light_is_told_from_another_exposure():
     assert found.strangers[1].startswith("it shows something else in")
 
 
-EXPOSED = (30, 120, 500, 2000)
-
-
 def dimmed(denominator, share=0.05):
     """The photograph with all lamps and the window dimmed."""
     linear = photograph()[0]
@@ -200,9 +197,9 @@ def covered(denominator, radiance=0.15):
 def test_a_part_of_the_picture_that_contradicts_the_others_is_told(fault, wrong, count):
     if wrong == count:
         return
-    images = [exposed(d).astype(np.uint8) for d in EXPOSED[:count]]
-    images[wrong] = fault(EXPOSED[wrong])
-    found = align(images, [circle()] * count, [1 / d for d in EXPOSED[:count]], 0 if wrong else 1)
+    images = [exposed(d).astype(np.uint8) for d in BRACKET[:count]]
+    images[wrong] = fault(BRACKET[wrong])
+    found = align(images, [circle()] * count, [1 / d for d in BRACKET[:count]], 0 if wrong else 1)
     assert [bool(why) for why in found.strangers] == [k == wrong for k in range(count)]
     assert not found.is_odd
 

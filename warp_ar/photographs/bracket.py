@@ -75,8 +75,10 @@ COMPARED = 256
 SHARED = 0.05
 """Smallest share of the ball well exposed in two pictures that tells the step between them."""
 CONTRARY = 0.02
-"""Share of a ball that may contradict another picture: up to 0.015 in nine real brackets, of which a blurred picture
+"""Share of a ball that may contradict another picture: up to 0.017 in nine real brackets, of which a blurred picture
 has the most."""
+BY_LIGHT = 3.0
+"""Weight of the pixels' light in that share, relative to that of their number."""
 GAMMAS = (1.5, 2.7)
 """Range of gammas at code 40 of cameras' 8-bit pictures: Rec. 709 has 1.7, sRGB 2.1; linear raw files need no
 estimate."""
@@ -227,7 +229,7 @@ def align(
         step = times[b] - times[a] if exposures and b == a + 1 else None
         shares[a, b] = shares[b, a] = disagreement(patches[a], patches[b], step)
     stay, is_odd = _agreeing(shares, anchor)
-    why = "it shows something else in {:.0%} of the ball (another place or light, or something before it)"
+    why = "it shows something else in {:.0%} of the ball (another place or light, blur, or something before it)"
     reasons = ["" if stays else why.format(np.nanmax(row)) for stays, row in zip(stay, shares, strict=True)]
     patches = [cut_ball(image, circle, cut) for image, circle in zip(images, found, strict=True)]
     return Aligned(tuple(found), tuple(patches), tuple(reasons), is_odd)
@@ -255,8 +257,7 @@ def disagreement(first: Image, other: Image, step: float | None = None) -> float
     """Return the share of a ball in which two aligned pictures of different exposures contradict each other.
 
     Equally bright places of one are equally bright in the other, whatever the response. Clipped pixels are lower
-    bounds, dark ones upper bounds. Pixels count by their number and by their light in equal parts, because lamps are
-    small.
+    bounds, dark ones upper bounds. Pixels count by their number and by their light, because lamps are small.
 
     Args:
         first: uint8 RGB (n, n, 3).
@@ -291,7 +292,7 @@ def disagreement(first: Image, other: Image, step: float | None = None) -> float
     # Single pixels and lines are edges.
     off = cv2.morphologyEx(np.uint8(off & told), cv2.MORPH_OPEN, near) > 0
     light = np.exp(np.maximum(_LOG_SRGB[v], np.minimum(low, 0.0)))
-    weight = told * (1.0 + light / light[told].mean())
+    weight = told * (1.0 + BY_LIGHT * light / light[told].mean())
     return float((off * weight).sum() / weight.sum())
 
 
