@@ -352,12 +352,6 @@ class WholeFragments:
         """Return FFmpeg's position in the file."""
         return self._at
 
-    def read(self, size: int = -1) -> bytes:
-        """Read at the current position: FFmpeg reads back data when it finishes the file."""
-        data = os.pread(self._file, max(self._size - self._at, 0) if size < 0 else size, self._at)
-        self._at += len(data)
-        return data
-
     def check(self) -> None:
         """Raise the error that ended the writing, if any.
 
