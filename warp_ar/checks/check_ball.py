@@ -90,7 +90,6 @@ def _check_ball(
 ) -> list[Finding]:
     circles = [(image, rough_circle(look.camera, pose, probe)) for image, pose in views]
     seen = [(image, circle) for image, circle in circles if circle is not None and _inside(look, circle)]
-    command = "python -m warp_ar.calibrate ball SCENE --write"
     if not seen:
         text = f"{label}: the ball is outside the picture"
         return [Finding("ball.outside", text, "move camera or ball until all of it is in view; check center")]
@@ -120,7 +119,7 @@ def _check_ball(
     if support < SEEN:
         text = f"{label}: only {support:.0%} of the ball's outline is seen"
         found.append(Finding("ball.hidden", text, "take away what is in front of the ball"))
-    off = _compare(probe, solution, label, command)
+    off = _compare(probe, solution, label)
     others = [other for other in scene.probes if other is not probe]
     seen_ball = dataclasses.replace(probe, center=solution.center, radius=solution.radius)
     # If the scene's ball explains its mirror image better than the solution does, the outlines are other edges.
@@ -149,15 +148,15 @@ def _check_reflectance(
     return [Finding("ball.reflectance", text, remedy)]
 
 
-def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> list[Finding]:
+def _compare(probe: Probe, solution: BallSolution, label: str) -> list[Finding]:
     """Return the findings on differences between a ball found in pictures and the scene's.
 
     Args:
         probe: The scene's ball.
         solution: The ball that explains the outlines.
         label: Name of the ball in messages.
-        command: Command that measures the ball.
     """
+    command = "python -m warp_ar.calibrate ball SCENE --write"
     if not solution.radius_assumed:
         off = solution.radius - probe.radius
         if abs(off) > max(RADIUS * probe.radius, 3 * solution.radius_deviation):

@@ -108,12 +108,9 @@ def _check_camera(camera: Camera) -> Iterator[Finding]:
 
 def _check_ball(scene: Scene, probe: Probe, label: str) -> Iterator[Finding]:
     radius, far = probe.radius, float(np.linalg.norm(probe.center))
-    if radius > LARGEST_BALL:
-        text = f"{label} radius = {radius:g} m{_in_metres(radius, 0.15)}"
-        yield Finding("units.ball", text, "write the radius in metres")
-        return
-    if radius < SMALLEST_BALL:
-        text = f"{label} radius = {radius:g} m: smaller than a pea"
+    if not SMALLEST_BALL <= radius <= LARGEST_BALL:
+        size = _in_metres(radius, 0.15) if radius > LARGEST_BALL else ": smaller than a pea"
+        text = f"{label} radius = {radius:g} m{size}"
         yield Finding("units.ball", text, "write the radius in metres")
         return
     if far > FARTHEST:
