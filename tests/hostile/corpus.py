@@ -30,7 +30,6 @@ from warp_ar.scene.shapes import torus_mesh
 from warp_ar.scene.textures import load_texture
 from warp_ar.sources.frame_folder import FrameFolder
 from warp_ar.sources.sources import open_source
-from warp_ar.sources.synthetic import Synthetic
 
 SCENE = """schema = 1
 name = "small"
@@ -297,5 +296,3 @@ READERS = (
     Reader("farm's run, run.json", "run.json", _status, _run),
     Reader("farm's run, manifest", "manifest.jsonl", _status, _run),
 )
-
-assert Synthetic.NAMES  # the scene's source is one of them
