@@ -122,8 +122,8 @@ const context = canvas.getContext("2d", { alpha: false });
 const pictures = [];
 let shown = null, since = 0, first = null, seen = 0;
 const draw = () => shown && context.drawImage(shown, 0, 0);
-setInterval(draw, 100);
-navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(10);
+setInterval(draw, 200);
+navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(5);
 window.canvasCamera = {
   async add(coded) {
     const bytes = Uint8Array.from(atob(coded), (letter) => letter.charCodeAt(0));
