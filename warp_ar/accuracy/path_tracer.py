@@ -23,21 +23,13 @@ from warp_ar.device import exclusive, resolve_device, translating, usable_cores
 from warp_ar.errors import UsageError
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table, encode_table
-from warp_ar.kernels.reference import path_tracer
+from warp_ar.kernels.reference import path_picture, path_tracer
 from warp_ar.kernels.reference.path_photons import (
     follow_lights,
     follows_lights,
     is_polished_one,
     make_light_image,
     spheres_around,
-)
-from warp_ar.kernels.reference.path_picture import (
-    add_samples,
-    finish_picture,
-    list_samples,
-    make_moments,
-    make_round,
-    map_reflectance,
 )
 from warp_ar.kernels.reference.path_sampling import make_sky
 from warp_ar.kernels.reference.path_vertices import LocalScene
@@ -233,8 +225,8 @@ class PathTracer:
     def _allocate(self) -> None:
         """Allocate the moments (sums over samples), which are 0, and the arrays of the picture."""
         shape = (self.camera.height, self.camera.width)
-        self._moments = make_moments(shape, self.device)
-        self._round = make_round(shape, self.device)
+        self._moments = path_picture.make_moments(shape, self.device)
+        self._round = path_picture.make_round(shape, self.device)
         self._shares = wp.ones(shape, dtype=wp.float32, device=self.device)
         self._image_of_lights = make_light_image(
             shape if self._follows_lights or self._follows_emitters else (0, 0), self.device
@@ -329,10 +321,10 @@ class PathTracer:
             room = self._most // (self.camera.width * self.camera.height)
             passes = 1 if self._sliced else min(count, max(1, room))
             with translating(self.device), wp.ScopedDevice(self.device):
-                list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes)
+                path_picture.list_samples(self._shares, self._round, seed=self.seed, begun=self._passes, count=passes)
             yield from self._in_parts("paths", trace, self._round.count)
             with translating(self.device), wp.ScopedDevice(self.device):
-                add_samples(self._round, self._moments)
+                path_picture.add_samples(self._round, self._moments)
             self._passes += passes
             count -= passes
             if asked == path_tracer.DIFFERENCE and (self._follows_lights or self._follows_emitters):
@@ -411,14 +403,14 @@ class PathTracer:
 
     def _map_reflectance(self) -> None:
         """Compute reflectance from the light in the moments, and clear the moments."""
-        map_reflectance(self._local, self._moments, self._local.reflectance)
+        path_picture.map_reflectance(self._local, self._moments, self._local.reflectance)
         found, shown = self._local.reflectance.numpy(), self._local.shown.numpy()
         means = [
             found[shown == k].mean(axis=0) if (shown == k).any() else np.full(3, UNKNOWN_REFLECTANCE)
             for k in range(len(self.scene.proxies))
         ]
         self._set_reflectances(means)
-        self._moments = make_moments(shown.shape, self.device)
+        self._moments = path_picture.make_moments(shown.shape, self.device)
         self._passes = 0
 
     def _share(self) -> None:
@@ -438,7 +430,7 @@ class PathTracer:
         kinds = int(self._follows_lights) + int(self._follows_emitters)
         followed = self._followed * kinds * self._paths_of_each() / (self.camera.width * self.camera.height)
         given = self._local.matt, self._encode, self._moments, self._image_of_lights, followed, self.exposure
-        finish_picture(*given, self._radiance, self._error, self._sampled, self._image)
+        path_picture.finish_picture(*given, self._radiance, self._error, self._sampled, self._image)
 
     def sample(self, count: int) -> None:
         """Add ``count`` samples per pixel on average; after ``FIRST_ROUND``, noisy neighbourhoods get more of them.

@@ -11,13 +11,7 @@ from warp_ar.kernels.environment import environment_samples, pyramid
 from warp_ar.kernels.environment.environment_samples import EnvironmentSample
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.environment_sets import (
-    REFERENCE_SIZE,
-    lists_texels,
-    sample_count,
-    sample_names,
-    sample_slots,
-)
+from warp_ar.stages.shared import environment_sets
 
 
 class EnvironmentSamples(Stage):
@@ -44,7 +38,7 @@ class EnvironmentSamples(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the samples, of the sums by which they are drawn, and for the reference of texels."""
         height, width = self.map_shape
-        count = sample_count(self.features)
+        count = environment_sets.sample_count(self.features)
         specs = {
             "environment_samples": ArraySpec((count,), EnvironmentSample, EnvironmentSample()),
             "environment_samples_directions": ArraySpec((count,), wp.vec3),
@@ -52,11 +46,11 @@ class EnvironmentSamples(Stage):
             "environment_samples_cumulative": ArraySpec(self.map_shape, wp.float32),
             "environment_samples_rows": ArraySpec((height,), wp.vec2),
         }
-        if not lists_texels(self.features):
+        if not environment_sets.lists_texels(self.features):
             return specs
         # For a smaller environment the remaining samples have weight 0.
-        rows, columns = REFERENCE_SIZE
-        texels = rows * columns * sample_slots(self.features)
+        rows, columns = environment_sets.REFERENCE_SIZE
+        texels = rows * columns * environment_sets.sample_slots(self.features)
         return {
             **specs,
             "environment_samples_map": ArraySpec((min(rows, height), min(columns, width)), wp.vec3),
@@ -87,8 +81,9 @@ class EnvironmentSamples(Stage):
             Pass(lambda rows: environment_samples.draw_samples(*known, *out)),
         ]
         found = [samples]
-        if lists_texels(self.features):
-            small, texels = arrays["environment_samples_map"], [arrays[name] for name in sample_names(self.features)]
+        if environment_sets.lists_texels(self.features):
+            small = arrays["environment_samples_map"]
+            texels = [arrays[name] for name in environment_sets.sample_names(self.features)]
             passes += [
                 Pass(lambda rows: pyramid.reduce_latlong(environment, small)),
                 Pass(lambda rows: environment_samples.list_texels(small, origin, turn, *texels)),

@@ -14,13 +14,7 @@ from warp_ar.scene.kinds import light_kind, proxies_face, trace_config
 from warp_ar.stages import base
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.lighting import (
-    distant_light_reads,
-    make_distant_light,
-    mirrored_shading,
-    shade_variant,
-    trace_variant,
-)
+from warp_ar.stages.shared import lighting
 from warp_ar.stages.shared.picture import GrowingRows, find_picture, frame_reads
 
 SAMPLES: Mapping[str, int] = {"single": 4, "smooth": 16, "brute_force": 256}
@@ -47,7 +41,7 @@ class Gloss(Stage):
             return LeftOut(base.NO_BALL)
         if "reflected" not in features.layers:
             return LeftOut("nothing virtual can be mirrored, or the quality leaves mirrors as the camera saw them")
-        reads = {"pose", *frame_reads(features), "objects", *distant_light_reads(features)}
+        reads = {"pose", *frame_reads(features), "objects", *lighting.distant_light_reads(features)}
         reads |= {"lights"} if features.request.scene.lights else set()
         reads |= {name for name in features.layers if name in ("shadow_ratio", "added_light", "mirror_ball")}
         return Wiring(tuple(sorted(reads)), ("reflected",))
@@ -74,7 +68,7 @@ class Gloss(Stage):
             if name in self.wiring.reads:
                 setattr(layers, field, arrays[name])
         sight.scene, sight.picture, sight.probes = arrays["ray_scene"], find_picture(arrays), arrays["probes"]
-        sight.distant, sight.layers = make_distant_light(self.features, arrays), layers
+        sight.distant, sight.layers = lighting.make_distant_light(self.features, arrays), layers
         lights = arrays["light_array"] if config.lights else None
         own = arrays["gloss_change"], arrays["gloss_surface"]
         mirror_ball = arrays["mirror_ball"] if "mirror_ball" in self.wiring.reads else None
@@ -88,12 +82,12 @@ class Gloss(Stage):
     def _config(self, device: Any) -> gloss.GlossConfig:
         """Return the compile-time configuration of the kernel."""
         features, scene = self.features, self.request.scene
-        shading = mirrored_shading(features) if scene.objects else None
+        shading = lighting.mirrored_shading(features) if scene.objects else None
         return gloss.GlossConfig(
-            trace_variant(trace_config(scene), device),
+            lighting.trace_variant(trace_config(scene), device),
             SAMPLES[self.request.quality.method("mirror_ball")],
             tuple(sorted({light_kind(light) for light in scene.lights})),
-            None if shading is None else shade_variant(shading, features, device),
+            None if shading is None else lighting.shade_variant(shading, features, device),
             features.emitters,
             proxies_face(scene),
         )

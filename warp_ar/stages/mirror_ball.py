@@ -14,19 +14,7 @@ from warp_ar.kernels.receiver.receiver import RelightConfig
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Stage, Wiring, over_rows
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.lighting import (
-    distant_light_reads,
-    find_receiver,
-    make_distant_light,
-    mirrored_shading,
-    relight_config,
-    relight_reads,
-    relight_variant,
-    shade_config,
-    shade_variant,
-    shares_kernels,
-    trace_variant,
-)
+from warp_ar.stages.shared import lighting
 from warp_ar.stages.shared.picture import GrowingRows, frame_reads
 
 SIDES: Mapping[str, int] = {"single": 1, "smooth": 2, "brute_force": 8}
@@ -36,7 +24,7 @@ SIDES: Mapping[str, int] = {"single": 1, "smooth": 2, "brute_force": 8}
 def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
     """Return the kernel's configuration with only the features that the scene needs."""
     layers = features.layers
-    shading = mirrored_shading(features) if "virtual" in layers else None
+    shading = lighting.mirrored_shading(features) if "virtual" in layers else None
     lit = "added_light" in layers
     return mirror_ball.MirrorBallConfig(
         trace_config(features.request.scene),
@@ -48,29 +36,31 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
 
 def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallConfig:
     """Return the kernel's configuration to compile: the scene's own on CUDA, one for any scene on CPU."""
-    if not shares_kernels(device):
+    if not lighting.shares_kernels(device):
         return mirror_config(features)
     return mirror_ball.MirrorBallConfig(
-        trace_variant(trace_config(features.request.scene), device),
-        shade_variant(mirrored_shading(features), features, device),
-        relight_variant(mirrored_relighting(features), features, device),
+        lighting.trace_variant(trace_config(features.request.scene), device),
+        lighting.shade_variant(lighting.mirrored_shading(features), features, device),
+        lighting.relight_variant(mirrored_relighting(features), features, device),
         ratio=True,
     )
 
 
 def mirrored_relighting(features: Features) -> RelightConfig:
     """Return the configuration for relighting the receiver in reflections, without cells of the frame."""
-    return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False, area_cells=False)
+    return dataclasses.replace(
+        lighting.relight_config(features), ambient_visibility=False, bounced=False, area_cells=False
+    )
 
 
 def _reads(features: Features, *, lit: bool) -> set[str]:
     """Return the resources that light the objects and, if ``lit``, the receiver."""
     reads = {"pose", *frame_reads(features)}
     if "virtual" in features.layers:
-        reads |= {"objects", *distant_light_reads(features)}
-        reads |= {"lights"} if shade_config(features).lights else set()
+        reads |= {"objects", *lighting.distant_light_reads(features)}
+        reads |= {"lights"} if lighting.shade_config(features).lights else set()
     if lit:
-        reads |= set(relight_reads(features)) - {"environment_samples"}
+        reads |= set(lighting.relight_reads(features)) - {"environment_samples"}
     if features.shadowed:
         reads.add("shadow_ratio")
     return reads
@@ -131,8 +121,8 @@ class MirrorBall(Stage):
         config = mirror_config(self.features)
         variant = mirror_variant(self.features, device)
         reads = self.wiring.reads
-        receiver = find_receiver(mirrored_relighting(self.features), self.features, arrays, reads)
-        distant = DistantLight() if config.shade is None else make_distant_light(self.features, arrays)
+        receiver = lighting.find_receiver(mirrored_relighting(self.features), self.features, arrays, reads)
+        distant = DistantLight() if config.shade is None else lighting.make_distant_light(self.features, arrays)
         inputs = (
             arrays["params"],
             arrays["ray_scene"],

@@ -8,17 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels.environment import prefilter, pyramid, sphere_map
-from warp_ar.kernels.environment.lobes import (
-    Lobe,
-    lobe_count,
-    lobe_offset,
-    lobe_rows,
-    lobe_size,
-    lobe_texels,
-    make_lobe_samples,
-    mip_weights,
-)
+from warp_ar.kernels.environment import lobes, prefilter, pyramid, sphere_map
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, over_rows
@@ -30,7 +20,7 @@ def glossy_materials(scene: Scene) -> list[Material]:
     return [material.surface for material in scene_materials(scene) if reflects_glossily(material)]
 
 
-def scene_lobe(scene: Scene) -> Lobe:
+def scene_lobe(scene: Scene) -> lobes.Lobe:
     """Return the lobe for all glossy materials: Phong if all are Phong, else GGX of the nearest widths."""
     kinds = {type(material) for material in glossy_materials(scene)} - {MirrorMaterial}
     return "phong" if kinds == {PhongMaterial} else "ggx"
@@ -88,15 +78,15 @@ class Prefilter(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Declare the arrays of the levels, and the pyramid from which they are filtered."""
         height = self.map_height
-        specs = {"prefilter_levels": ArraySpec((lobe_texels(height),), wp.vec3)}
+        specs = {"prefilter_levels": ArraySpec((lobes.lobe_texels(height),), wp.vec3)}
         if others := self._others(self.features):
-            specs["others_levels"] = ArraySpec((others, lobe_texels(height)), wp.vec3)
+            specs["others_levels"] = ArraySpec((others, lobes.lobe_texels(height)), wp.vec3)
         if self.method == "sphere_mip":
             return specs
         if self.method != "brute_force" and not self._mirrors_only:
             specs["prefilter_pyramid"] = ArraySpec((pyramid.packed_texels(*self.map_shape),), wp.vec3)
-            specs["prefilter_row_energy"] = ArraySpec((lobe_rows(height),), wp.vec3)
-            specs["prefilter_energy"] = ArraySpec((lobe_count(height),), wp.vec3)
+            specs["prefilter_row_energy"] = ArraySpec((lobes.lobe_rows(height),), wp.vec3)
+            specs["prefilter_energy"] = ArraySpec((lobes.lobe_count(height),), wp.vec3)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -121,10 +111,10 @@ class Prefilter(Stage):
         mips = arrays["prefilter_pyramid"]
         passes = [Pass(lambda rows: pyramid.build_pyramid(environment, mips))]
         if self.method == "energy_mip":
-            weights = wp.array(mip_weights(height, lobe).astype(np.float32), dtype=wp.float32, device=device)
+            weights = wp.array(lobes.mip_weights(height, lobe).astype(np.float32), dtype=wp.float32, device=device)
             passes.append(over_rows(texels, prefilter.mix_mips, mips, weights, height, levels))
         else:
-            drawn = make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
+            drawn = lobes.make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
             samples = drawn.directions, drawn.weights
             passes.append(over_rows(texels, prefilter.sample_lobes, mips, *samples, height, levels))
         row_energy, energy = arrays["prefilter_row_energy"], arrays["prefilter_energy"]
@@ -137,11 +127,11 @@ class Prefilter(Stage):
     def _look_up(self, arrays: Arrays) -> list[Pass]:
         """Return one pass per lobe, which writes its map from a sphere map level; mirrors need the first lobe alone."""
         height = self.map_height
-        lobes = lobe_count(height)
+        count = lobes.lobe_count(height)
         known, out = (arrays["params"], arrays["sphere_map"]), arrays["prefilter_levels"]
         passes = []
-        for lobe in range(1 if self._mirrors_only else lobes):
-            size = lobe_size(height, lobe)
-            place, first = (sphere_map.glossy_level(lobe, lobes), size, out), lobe_offset(height, lobe)
+        for lobe in range(1 if self._mirrors_only else count):
+            size = lobes.lobe_size(height, lobe)
+            place, first = (sphere_map.glossy_level(lobe, count), size, out), lobes.lobe_offset(height, lobe)
             passes.append(over_rows(size[0], sphere_map.look_up_level, *known, *place, first=first))
         return passes
