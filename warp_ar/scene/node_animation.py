@@ -19,7 +19,6 @@ References:
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
@@ -159,12 +158,13 @@ class MovingMesh:
 
 def part_transforms(anchors: tuple[Anchor, ...], wanted: list[int], seconds: float) -> Array:
     """Return ``file_from_anchor`` of the wanted anchors, (n, 4, 4)."""
-
-    @functools.cache
-    def placed(number: int) -> Array:
-        if number < 0:
-            return np.eye(4)
-        anchor = anchors[number]
-        return np.asarray(placed(anchor.parent) @ (anchor.offset @ anchor.track.transform_at(seconds)))
-
-    return np.stack([placed(number) for number in wanted])
+    placed = {-1: np.eye(4)}
+    for number in wanted:
+        way: list[int] = []  # ancestors that are not placed yet; a file may nest thousands
+        while number not in placed:
+            way.append(number)
+            number = anchors[number].parent
+        for own in reversed(way):
+            anchor = anchors[own]
+            placed[own] = placed[anchor.parent] @ (anchor.offset @ anchor.track.transform_at(seconds))
+    return np.stack([placed[number] for number in wanted])
