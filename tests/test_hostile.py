@@ -89,7 +89,7 @@ def test_limits_are_set_by_the_environment(tmp_path: pathlib.Path, monkeypatch: 
 def test_every_limit_is_in_the_docs() -> None:
     text = table.FILE.read_text()
     for name, value in vars(files.Limits()).items():
-        assert f"| `{files.variable_of(name)}` | {value:,} |" in text
+        assert f"- `{files.variable_of(name)}` ({value:,}): " in text
 
 
 def test_sizes_are_those_of_the_decoders(tmp_path: pathlib.Path) -> None:
