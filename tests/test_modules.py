@@ -153,7 +153,6 @@ def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch,
     lit = []
     for shared in (True, False):
         monkeypatch.setattr(lighting, "shares_kernels", lambda device, shared=shared: shared)
-        monkeypatch.setattr("warp_ar.stages.mirror_ball.shares_kernels", lambda device, shared=shared: shared)
         with Pipeline(scene, device="cpu", quality=quality, estimates="synchronous") as pipeline:
             lit.append([pipeline(image, time_seconds=k / 24.0).image for k, image in enumerate(images)])
     np.testing.assert_array_equal(lit[0], lit[1])
