@@ -317,10 +317,10 @@ class World:
 
 
 def _face_radiance(block: Block, faces: list[NDArray[np.float32]], at: Array, face: NDArray[np.int64]) -> Array:
-    """Return the radiance of points on a block's faces, (k, 3).
+    """Return the radiance that points on a block's faces reflect, (k, 3): interpolated irradiance times albedo / pi.
 
     Args:
-        block: The box.
+        block: The block, a box.
         faces: Irradiance at 5 x 5 points of each of its six faces.
         at: The points, (k, 3).
         face: Index of each point's face, (k,).

@@ -214,13 +214,16 @@ Args:
 
 
 def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = math.inf) -> None:
-    """Build the coarser levels of a seeded fill pyramid and complete them, all but level 0.
+    """Build the coarser levels of a fill pyramid from level 0, then fill the holes of each from the next coarser one.
+
+    Level 0 keeps its holes; ``finish_fill`` fills them.
 
     Args:
         levels_out: Written by ``seed_fill``; changed in place.
         height: Rows of level 0.
         width: Columns of level 0.
-        most: Upper bound of a texel's radiance in means, so that an emitter does not spread over missing neighbours.
+        most: Upper bound to which radiance is clamped before texels are averaged for a coarser level, so that an
+            emitter does not spread over missing neighbours.
     """
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]

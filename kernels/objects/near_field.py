@@ -423,9 +423,10 @@ def make_see_point(config: NearFieldConfig) -> wp.Function:
 
 @wp.func
 def make_sample_ray(sample: EnvironmentSample, at: SeenPoint, share: wp.float32) -> NearRay:
-    """Return the ray from ``at`` toward an environment sample, of weight 0 if the sample is behind the surface.
+    """Return the ray from ``at`` toward an environment sample; its weight is 0 if the sample is behind the surface.
 
-    ``share`` is the weight at the point of the ball to which the sample belongs.
+    ``share`` is the interpolation weight, 0 to 1, of the mirror ball whose environment the sample was drawn from; it is
+    1 with a single ball.
     """
     out = NearRay()
     toward = sample_toward(sample, at.hit.point)

@@ -43,7 +43,9 @@ class LayersAt:
 
 @wp.func
 def read_layers(params: wp.array[FrameParams], layers: Layers, row: wp.int32, col: wp.int32) -> LayersAt:
-    """Return the layers at a pixel; 0, or 1 for the ratio, if a layer is empty or its rectangle excludes the pixel.
+    """Return the value of every layer at a pixel.
+
+    A layer that is empty, or whose rectangle excludes the pixel, has the value 0; the shadow ratio then is 1.
 
     All layers are read before any value is used, so that their memory latencies overlap.
     """

@@ -366,12 +366,12 @@ def _lowest(factors: Array, totals: Array) -> float:
 
 
 def _cell_values(marker: Marker, look: Look, image: Image, pose: Pose) -> tuple[Array, Array, Array]:
-    """Return positions (n, 3) and codes (n, 3) of the print's white cells in a picture, and codes (m, 3) of black ones.
+    """Return the marker's white cells in an image, positions and 8-bit RGB values, and the values of its black cells.
 
     Args:
         marker: The printed card.
-        look: Frames, with their camera.
-        image: The picture.
+        look: Frames of the same camera; only the camera is used.
+        image: The image.
         pose: ``camera_from_world``.
     """
     cells, white = pattern_of(marker).cells, pattern_of(marker).white

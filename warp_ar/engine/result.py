@@ -151,10 +151,10 @@ class Result:
 
     @functools.cached_property
     def emitters(self) -> npt.NDArray[Any] | None:
-        """Emitters of the environment with their positions, as an independent array for ``Pipeline.take_light``.
+        """Emitters of the environment and their positions, as a copy that ``Pipeline.take_light`` accepts.
 
-        None if the environment is not an output or has not been captured yet, or if the quality does not find the
-        positions.
+        None if the environment is not among the requested outputs or has not been captured yet, or if the quality's
+        method does not locate emitters.
         """
         rendered = self._rendered.result()
         if rendered.emitters is not None or rendered.emitters_array is None:

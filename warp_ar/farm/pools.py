@@ -209,12 +209,12 @@ _worker: tuple[Any, Sequence[int]] | None = None
 
 
 def _begin(context: Context, cores: Sequence[int], every: Sequence[int]) -> None:
-    """Make this process a worker, which ends with its driver, is bound to its cores and writes to a log.
+    """Make this process a worker: it ends with the process that started it, runs on its own cores and writes to a log.
 
     Args:
         context: Context of the run for this worker.
-        cores: Numbers of the worker's cores.
-        every: Numbers of the cores of all workers.
+        cores: Indices of the cores of this worker; empty: it is not bound to cores.
+        every: Indices of the cores of all workers, which surveys may use.
     """
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -74,11 +74,11 @@ def join_parts(
 
     Args:
         parts: Videos from ``open_part_sink``, in order.
-        starts: Time stamp in the recording of each segment's first frame, in ticks.
+        starts: For each segment, the time stamp that its first frame has in the recording, in ticks.
         tick: Duration of a tick in seconds.
         output: The MP4 to write.
         recording: Source of sound and metadata; None if it is not a video.
-        zero: Time stamp in ticks that becomes 0 in the file.
+        zero: Time stamp in the recording, in ticks, that becomes time 0 of the joined file.
         until: Time in seconds of the recording at which the sound ends; None: at its own end.
 
     Returns:
@@ -140,10 +140,10 @@ def _video_packets(
 
     Args:
         parts: Videos of the segments, in order.
-        starts: Time stamp in the recording of each segment's first frame, in ticks.
+        starts: For each segment, the time stamp that its first frame has in the recording, in ticks.
         tick: Duration of a tick in seconds.
         header: Header of the encoder, which must be equal in all segments.
-        zero: Time stamp in ticks that becomes 0 in the file.
+        zero: Time stamp in the recording, in ticks, that becomes time 0 of the joined file.
 
     Raises:
         SourceError: A segment was encoded differently or has wrong time stamps.

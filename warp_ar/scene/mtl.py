@@ -198,7 +198,12 @@ class _Library:
         return self._with_channels(white, {k: (one, one.values()) for k, one in found.items() if one is not None})
 
     def _with_channels(self, into: _Map, channels: dict[int, tuple[_Map, ByteArray]]) -> _Map:
-        """Return a picture with some channels replaced by the values of other pictures."""
+        """Return a copy of the picture ``into`` with some channels replaced.
+
+        Args:
+            into: The picture.
+            channels: For each replaced channel's number, the picture that its values come from, and these values.
+        """
         picture = into.picture.copy()
         for channel, (one, values) in channels.items():
             if (one.transform, one.clamped) != (into.transform, into.clamped):

@@ -44,7 +44,12 @@ _OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
 def pose_of_placement(rotation: Matrix, position: Matrix) -> RawPose:
-    """Return ``camera_from_world`` from the rotation and position of ``world_from_camera``, with OpenCV's axes."""
+    """Invert a camera's placement: return ``camera_from_world``.
+
+    Args:
+        rotation: ``world_from_camera``, (3, 3). The camera's axes are OpenCV's here and in the result.
+        position: Position of the camera in the world, metres, (3,).
+    """
     inverse = rotation.T
     x, y, z = map(float, -inverse @ position)
     return tuple(map(float, inverse.reshape(-1))), (x, y, z)

@@ -328,7 +328,7 @@ class SetupChecks:
         return found.words
 
     def _response(self, scene: Scene, look: Look) -> str:
-        """Measure the camera's response from the grey patches of the card."""
+        """Measure the camera's response from the card's grey patches, and return a message for the page."""
         found = measure_grey_response(look.images)
         interval = 2 * found.deviation[128].max()
         if interval > MOST_DEVIATION:
