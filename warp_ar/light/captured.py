@@ -34,7 +34,6 @@ from warp_ar.declared import check_fields, checked
 from warp_ar.errors import SceneError, SinkError, UsageError, reason
 from warp_ar.exr_file import read_exr_header, read_linear_picture, write_exr
 from warp_ar.files import parse_json, write_whole
-from warp_ar.kernels.structs import Emitter, struct_dtype
 from warp_ar.light.latlong_axes import DESCRIPTIONS, axes_of, from_axes, to_axes, world_from_marker
 from warp_ar.signals import REC_709
 
@@ -336,6 +335,8 @@ def placed_emitters(
         scale: Factor to the camera values of the frames.
         rotation: Rotation from the light's axes to the scene's, (3, 3); None: the axes are the same.
     """
+    from warp_ar.kernels.structs import Emitter, struct_dtype  # imported here: the page is served before Warp is loaded
+
     turn = np.eye(3) if rotation is None else rotation
     placed = [emitter for emitter in emitters if emitter.distance is not None]
     records = np.zeros(len(placed), struct_dtype(Emitter))

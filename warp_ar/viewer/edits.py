@@ -509,7 +509,11 @@ def _spot(item: Any) -> tuple[npt.NDArray[np.float64], float]:
     """Return a circle on the desk that an object, light or ball occupies: its centre, (2,), and its radius, metres."""
     if isinstance(item, Probe):
         return np.array(item.center[:2]), item.radius
-    return np.array(item.at[:2]), _LIGHT_REACH if isinstance(item, Light) else _reach(item)
+    if isinstance(item, Light):
+        return np.array(item.at[:2]), _LIGHT_REACH
+    low, high = _box(item)
+    middle = rotation_matrix(item.rotate) @ (0.5 * (low + high))
+    return (middle + item.at)[:2], 0.25 * float((high - low)[:2].sum())
 
 
 def _apart(scene: Scene, item: Any) -> Any:
